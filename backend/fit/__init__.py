@@ -1,0 +1,1 @@
+"""Fitting: priors, losses, optimisers, the filter over time."""

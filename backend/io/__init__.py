@@ -1,0 +1,1 @@
+"""Files: video, images, HDF5, OpenVDB. Whole or absent, never half."""

@@ -1,0 +1,1 @@
+"""The fluid: position-based dynamics of physical particles. Never imports backend.render."""

@@ -1,0 +1,1 @@
+"""The differentiable renderer of Gaussian particles. Never imports backend.physics."""

@@ -1,0 +1,21 @@
+"""Names the checkout `wildsmoke` for the tests, whatever its folder is called."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parent
+
+if str(CHECKOUT) not in sys.path:
+    sys.path.insert(0, str(CHECKOUT))
+
+if "wildsmoke" not in sys.modules and (CHECKOUT / "__init__.py").exists():
+    spec = importlib.util.spec_from_file_location(
+        "wildsmoke", CHECKOUT / "__init__.py", submodule_search_locations=[str(CHECKOUT)]
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["wildsmoke"] = module
+    spec.loader.exec_module(module)
