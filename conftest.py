@@ -15,7 +15,8 @@ if "wildsmoke" not in sys.modules and (CHECKOUT / "__init__.py").exists():
     spec = importlib.util.spec_from_file_location(
         "wildsmoke", CHECKOUT / "__init__.py", submodule_search_locations=[str(CHECKOUT)]
     )
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["wildsmoke"] = module
     spec.loader.exec_module(module)

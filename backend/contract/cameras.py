@@ -51,7 +51,9 @@ def read_cameras(path: str | os.PathLike[str], *, num_frames: int | None = None)
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise BackendError("cameras_unreadable", f"{path} cannot be read: {error}.", hint="Give the path of a cameras.json.") from error
+        raise BackendError(
+            "cameras_unreadable", f"{path} cannot be read: {error}.", hint="Give the path of a cameras.json."
+        ) from error
     return parse_cameras(text, name=str(path), num_frames=num_frames)
 
 
@@ -66,10 +68,11 @@ def parse_cameras(text: str, *, name: str = "cameras.json", num_frames: int | No
     if data.get("axes", "opencv") != "opencv" or data.get("up", "z") != "z":
         raise _bad(name, 'has other axes than "opencv" with up "z"')
     numbers = {key: _number(name, data, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "fps")}
+    width, height = numbers["width"], numbers["height"]
     for key in ("width", "height", "fx", "fy", "fps"):
         if numbers[key] <= 0:
             raise _bad(name, f"has {key} = {numbers[key]:g}, which is not positive")
-    if not (numbers["width"].is_integer() and numbers["height"].is_integer()):
+    if not (width.is_integer() and height.is_integer()):
         raise _bad(name, "has a size that is not whole pixels")
     matrices = data.get("camera_to_world")
     if not isinstance(matrices, list) or not matrices:
@@ -83,8 +86,16 @@ def parse_cameras(text: str, *, name: str = "cameras.json", num_frames: int | No
             f"{name} has {len(checked)} cameras for {num_frames} frames.",
             hint="Give one camera for each frame, or a single one for a camera that stands still.",
         )
-    size = {"width": int(numbers.pop("width")), "height": int(numbers.pop("height"))}
-    return Cameras(**size, **numbers, camera_to_world=checked)
+    return Cameras(
+        width=int(width),
+        height=int(height),
+        fx=numbers["fx"],
+        fy=numbers["fy"],
+        cx=numbers["cx"],
+        cy=numbers["cy"],
+        fps=numbers["fps"],
+        camera_to_world=checked,
+    )
 
 
 def _bad(name: str, problem: str) -> BackendError:
@@ -108,9 +119,7 @@ def _matrix(name: str, frame: int, matrix: Any) -> Matrix:
         raise _bad(name, f"has NaN, infinity or no number in {where}")
     rows = tuple(tuple(float(v) for v in row) for row in matrix)
     a, b, c = (row[:3] for row in rows[:3])
-    determinant = (
-        a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
+    determinant = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     if abs(determinant) < 1e-9:
         raise _bad(name, f"has a singular {where}")
     columns = list(zip(a, b, c, strict=True))

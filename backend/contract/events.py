@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Union
+from typing import Any, ClassVar
 
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 1 << 20  # a longer line is not an event
@@ -101,7 +101,7 @@ class CancelledEvent:
     stage: str | None = None
 
 
-Event = Union[Hello, Stage, Progress, Artifact, Warning, Done, Error, CancelledEvent]
+Event = Hello | Stage | Progress | Artifact | Warning | Done | Error | CancelledEvent
 LAST_EVENTS = (Done, Error, CancelledEvent)
 _TYPES: dict[str, type] = {kind.event: kind for kind in (Hello, Stage, Progress, Artifact, Warning, Done, Error, CancelledEvent)}
 _FIELD_TYPES: dict[str, tuple[type, ...]] = {

@@ -10,9 +10,10 @@ import dataclasses
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any
 
 from .errors import BackendError
 from .units import JOB_FORMAT_VERSION
@@ -290,7 +291,9 @@ class Job:
 
     def to_json(self) -> str:
         """The text of job.json."""
-        return json.dumps({"format_version": JOB_FORMAT_VERSION, **dataclasses.asdict(self)}, indent=2, sort_keys=True, allow_nan=False)
+        return json.dumps(
+            {"format_version": JOB_FORMAT_VERSION, **dataclasses.asdict(self)}, indent=2, sort_keys=True, allow_nan=False
+        )
 
 
 _JOB_TYPES: dict[str, tuple[type, ...]] = {

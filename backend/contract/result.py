@@ -55,7 +55,9 @@ def read_result(job_folder: str | os.PathLike[str]) -> Result:
     """The result of a job folder. Raises BackendError if the job is not finished or the file is damaged."""
     path = Path(job_folder) / RESULT_FILE
     if not path.is_file():
-        raise BackendError("not_finished", f"{job_folder} holds no finished job.", hint="Run the job to its end; it resumes where it stopped.")
+        raise BackendError(
+            "not_finished", f"{job_folder} holds no finished job.", hint="Run the job to its end; it resumes where it stopped."
+        )
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         if data.pop("format_version") != RESULT_FORMAT_VERSION:
