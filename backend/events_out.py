@@ -1,0 +1,162 @@
+"""Where events go: JSON lines in a pipe, a progress display in a terminal; and where a request to stop comes from."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from typing import IO, Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from backend.contract import events
+from backend.contract.errors import Cancelled
+
+STOP_AFTER_ORPHANED = 1.5  # seconds a step may still take once Blender is gone
+STOP_AFTER_CANCEL = 5.0  # seconds a step may still take after a cancel
+
+
+class EventSink(Protocol):
+    """Takes the events of a run in order."""
+
+    def send(self, event: events.Event) -> None: ...
+
+
+class PipeSink:
+    """JSON lines on what was standard output; everything else that prints goes to standard error from now on."""
+
+    def __init__(self) -> None:
+        sys.stdout.flush()
+        self._stream: IO[str] = os.fdopen(os.dup(1), "w", encoding="utf-8", newline="\n")
+        os.dup2(2, 1)
+        self._lock = threading.Lock()
+        self._is_closed = False
+
+    def send(self, event: events.Event) -> None:
+        with self._lock:
+            if self._is_closed:
+                return
+            self._is_closed = isinstance(event, events.LAST_EVENTS)
+            try:
+                self._stream.write(events.encode(event) + "\n")
+                self._stream.flush()
+            except (BrokenPipeError, ValueError):
+                self._is_closed = True  # nobody listens any more; the end of standard input will stop the work
+
+
+class TerminalSink:
+    """A line a stage with its bar and time left."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True, highlight=False)
+        self._progress = Progress(
+            TextColumn("{task.description:<10}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.completed}/{task.total}"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+            console=self._console,
+        )
+        self._task = None
+        self._progress.start()
+
+    def send(self, event: events.Event) -> None:
+        match event:
+            case events.Hello():
+                self._console.print(f"wildsmoke {event.version} on {event.device}")
+            case events.Stage(skipped=True):
+                self._console.print(f"{event.name:<10} there already")
+            case events.Stage():
+                self._task = self._progress.add_task(event.name, total=None, left="")
+            case events.Progress() if self._task is not None:
+                left = "" if event.seconds_left is None else f"{event.seconds_left:.0f} s left"
+                self._progress.update(self._task, completed=event.step, total=event.total, left=left)
+            case events.Warning():
+                self._console.print(f"[yellow]warning:[/yellow] {event.message}")
+            case events.Done():
+                self._progress.stop()
+                self._console.print(f"done in {event.seconds:.0f} s")
+            case events.Error():
+                self._progress.stop()
+                self._console.print(f"[red]{event.message}[/red] {event.hint}")
+            case events.CancelledEvent():
+                self._progress.stop()
+                self._console.print("cancelled; what was computed is kept, the next run resumes")
+            case _:
+                return
+
+
+class StopRequest:
+    """Set when the user cancels, or when standard input ends because the parent died."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+
+    def set(self) -> None:
+        self._event.set()
+
+    def check(self) -> None:
+        """Raises Cancelled when a stop was asked for."""
+        if self._event.is_set():
+            raise Cancelled
+
+
+def watch_standard_input(stop: StopRequest, sink: EventSink) -> None:
+    """Follow the parent's commands in a thread.
+
+    A step that does not end soon after a stop is abandoned: nothing half-written ever looks whole, so leaving at
+    once is as safe as being killed.
+    """
+
+    def follow() -> None:
+        patience = STOP_AFTER_ORPHANED
+        for line in iter(sys.stdin.readline, ""):
+            if events.is_cancel(line):
+                patience = STOP_AFTER_CANCEL
+                break
+        stop.set()
+        time.sleep(patience)
+        sink.send(events.CancelledEvent())
+        os._exit(0)
+
+    if sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
+        threading.Thread(target=follow, name="standard-input", daemon=True).start()
+
+
+class StageReport:
+    """A stage's Report: turns steps into progress events with the time left, at most ten a second."""
+
+    def __init__(self, stage: str, sink: EventSink, stop: StopRequest, warnings: list[dict[str, str]]) -> None:
+        self._stage = stage
+        self._sink = sink
+        self._stop = stop
+        self._warnings = warnings
+        self._began: tuple[float, int] | None = None
+        self._sent = 0.0
+
+    def progress(self, step: int, total: int, **metrics: float) -> None:
+        self._stop.check()
+        now = time.monotonic()
+        if self._began is None:
+            self._began = (now, step)
+        if step < total and now - self._sent < 1.0 / events.MAX_PROGRESS_PER_SECOND:
+            return
+        self._sent = now
+        done = step - self._began[1]
+        left = (now - self._began[0]) / done * (total - step) if done > 0 else None
+        finite = {name: float(value) for name, value in metrics.items() if abs(float(value)) < float("inf")}
+        self._sink.send(events.Progress(stage=self._stage, step=step, total=total, seconds_left=left, metrics=finite))
+
+    def warning(self, code: str, message: str) -> None:
+        entry = {"code": code, "message": message}
+        if entry not in self._warnings:
+            self._warnings.append(entry)
+            self._sink.send(events.Warning(code=code, message=message))
+
+
+def describe(event: events.Event) -> str:
+    """An event as a line of the log."""
+    return json.dumps({"event": event.event, **json.loads(events.encode(event))})

@@ -1,0 +1,38 @@
+"""What the fit carries from frame to frame. Each record holds all that the next frame depends on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhysicalRecord:
+    """The physical particles of a frame, and what was learned about the fluid up to it."""
+
+    positions: np.ndarray  # [N, 3] float64 m
+    velocities: np.ndarray  # [N, 3] float64 m/s
+    masses: np.ndarray  # [N] float64 m^2, the optical mass that each one stands for
+    ids: np.ndarray  # [N] int64, never used twice
+    born: np.ndarray  # [N] int32, frame
+    next_id: np.ndarray  # [] int64
+    smoothing_length: np.ndarray  # [] float64 m
+    rest_density: np.ndarray  # [] float64
+    buoyancy: np.ndarray  # [3] float64 m/s^2, learned so far
+    buoyancy_normal: np.ndarray  # [3, 3] float64, accumulated normal equations
+    buoyancy_moment: np.ndarray  # [3] float64, their right-hand side
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisualRecord:
+    """The Gaussians of a frame."""
+
+    positions: np.ndarray  # [N, 3] float64 m
+    velocities: np.ndarray  # [N, 3] float32 m/s
+    scales: np.ndarray  # [N] float32 m, standard deviation
+    optical_masses: np.ndarray  # [N] float32 m^2
+    colors: np.ndarray  # [N, 3] float32 linear
+    ids: np.ndarray  # [N] int64, never used twice
+    born: np.ndarray  # [N] int32, frame
+    next_id: np.ndarray  # [] int64
