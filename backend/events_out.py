@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import threading
@@ -129,11 +128,11 @@ def watch_standard_input(stop: StopRequest, sink: EventSink) -> None:
 class StageReport:
     """A stage's Report: turns steps into progress events with the time left, at most ten a second."""
 
-    def __init__(self, stage: str, sink: EventSink, stop: StopRequest, warnings: list[dict[str, str]]) -> None:
+    def __init__(self, stage: str, sink: EventSink, stop: StopRequest) -> None:
         self._stage = stage
         self._sink = sink
         self._stop = stop
-        self._warnings = warnings
+        self.warnings: list[dict[str, str]] = []
         self._began: tuple[float, int] | None = None
         self._sent = 0.0
 
@@ -152,11 +151,6 @@ class StageReport:
 
     def warning(self, code: str, message: str) -> None:
         entry = {"code": code, "message": message}
-        if entry not in self._warnings:
-            self._warnings.append(entry)
+        if entry not in self.warnings:
+            self.warnings.append(entry)
             self._sink.send(events.Warning(code=code, message=message))
-
-
-def describe(event: events.Event) -> str:
-    """An event as a line of the log."""
-    return json.dumps({"event": event.event, **json.loads(events.encode(event))})

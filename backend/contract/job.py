@@ -99,7 +99,7 @@ class CamerasConfig:
 class PhysicalConfig:
     """Position-based fluid: where the smoke moves.
 
-    num_particles: in the first frame. solver_iterations: density projections a substep.
+    num_particles: in the frame that shows most smoke. solver_iterations: density projections a substep.
     max_substeps: a frame is split so that no particle crosses more than 0.4 smoothing lengths a substep.
     drag: towards the surrounding air, 1/s. flow_gain: share of the observed image motion taken on a frame, 0 to 1.
     correction_iterations: gradient steps on the image a frame. learn_buoyancy: fit strength and direction.
@@ -145,14 +145,20 @@ class VisualConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForecastConfig:
-    """The most likely next frames. num_frames: 0 for none. damping: share of the velocity lost a second, 1/s."""
+    """The most likely next frames.
+
+    num_frames: 0 for none. damping: share of the velocity lost a second, 1/s. persistence: how much of the carried
+    smoke a step keeps against the frozen last frame, 0 (freeze) to 1 (pure motion).
+    """
 
     num_frames: int = 0
     damping: float = 0.5
+    persistence: float = 0.9
 
     def __post_init__(self) -> None:
         _check("num_frames", self.num_frames, 0, 10_000)
         _check("damping", self.damping, 0.0, 100.0)
+        _check("persistence", self.persistence, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

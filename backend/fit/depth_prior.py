@@ -23,11 +23,14 @@ class DepthPrior:
     """Per pixel of the optical-depth image: where along the ray the smoke is."""
 
     half_thickness: np.ndarray  # [H, W] m, half the chord of the solid; positive where there is smoke
-    center_depth: float  # m along the optical axis
+    center_depth: np.ndarray  # [H, W] m along the optical axis
 
 
-def inflate(optical_depth: np.ndarray, view: View, *, center_depth: float) -> DepthPrior:
-    """The solid of medial balls of a silhouette. optical_depth [H, W]; center_depth m along the optical axis."""
+def inflate(optical_depth: np.ndarray, view: View, anchor: np.ndarray) -> DepthPrior:
+    """The solid of medial balls of a silhouette, about the upright plane through the anchor that faces the camera.
+
+    optical_depth [H, W]; anchor [3] m, a point of the smoke in the world.
+    """
     height, width = optical_depth.shape
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -36,8 +39,29 @@ def inflate(optical_depth: np.ndarray, view: View, *, center_depth: float) -> De
     chord = _ball_union(mask)
     chord = cv2.GaussianBlur(chord, (0, 0), 1.5)  # the union of balls has creases, smoke has none
     full = cv2.resize(chord, (width, height), interpolation=cv2.INTER_LINEAR)
-    metres_per_pixel = center_depth / (0.5 * (view.fx + view.fy)) / scale
-    return DepthPrior(half_thickness=np.maximum(full, 0.5) * metres_per_pixel, center_depth=center_depth)
+    center = plane_depth(view, anchor)
+    metres_per_pixel = center / (0.5 * (view.fx + view.fy)) / scale
+    return DepthPrior(half_thickness=np.maximum(full, 0.5) * metres_per_pixel, center_depth=center)
+
+
+def plane_depth(view: View, anchor: np.ndarray) -> np.ndarray:
+    """Depth [H, W] m at which each pixel's ray meets the upright plane through the anchor that faces the camera.
+
+    A camera that looks steeply down has no such plane; then the plane is parallel to the image. Depth is kept within
+    a factor two of the anchor's, which a plane seen at a slant would leave near the horizon.
+    """
+    forward = view.camera_to_world[:3, 2]
+    normal = np.array([forward[0], forward[1], 0.0])
+    if np.linalg.norm(normal) < 0.5:
+        normal = forward
+    normal = normal / np.linalg.norm(normal)
+    x = (np.arange(view.width) + 0.5 - view.cx) / view.fx
+    y = (np.arange(view.height) + 0.5 - view.cy) / view.fy
+    axes = view.camera_to_world[:3, :3].T @ normal  # the normal in camera axes
+    slope = axes[0] * x[None, :] + axes[1] * y[:, None] + axes[2]
+    own = max(float(view.to_camera(anchor[None])[0, 2]), 1e-9)
+    depth = float(normal @ (anchor - view.position)) / np.maximum(slope, 1e-6)
+    return np.clip(depth, 0.5 * own, 2.0 * own)
 
 
 def _ball_union(mask: np.ndarray) -> np.ndarray:
@@ -91,7 +115,8 @@ def sample_points(
     pixels = np.stack([columns + random.random(count), rows + random.random(count)], axis=1)
     quantile = (random.random() + np.arange(count) * 0.6180339887498949) % 1.0
     offset = _profile_quantile(random.permutation(quantile)) * prior.half_thickness[rows, columns]
-    return view.unproject(pixels, np.maximum(prior.center_depth + offset, 1e-3 * prior.center_depth)), pixels
+    center = prior.center_depth[rows, columns]
+    return view.unproject(pixels, np.maximum(center + offset, 1e-2 * center)), pixels
 
 
 _S = np.linspace(-1.0, 1.0, 513)

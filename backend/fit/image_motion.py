@@ -45,9 +45,7 @@ def lift_flow(
     pixels, depth = first.project(positions)
     rows = np.clip(pixels[:, 1].astype(np.int64), 0, first.height - 1)
     columns = np.clip(pixels[:, 0].astype(np.int64), 0, first.width - 1)
-    is_seen = (
-        (depth > 0) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < first.width) & (pixels[:, 1] < first.height)
-    )
+    is_seen = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < first.width) & (pixels[:, 1] < first.height)
     depth_after = second.project(positions)[1]
     target = second.unproject(pixels + flow[rows, columns], depth_after)
     confidence = np.where(is_seen, np.minimum(1.0, 4.0 * opacity[rows, columns]), 0.0)

@@ -20,8 +20,9 @@ class PhysicalRecord:
     smoothing_length: np.ndarray  # [] float64 m
     rest_density: np.ndarray  # [] float64
     buoyancy: np.ndarray  # [3] float64 m/s^2, learned so far
-    buoyancy_normal: np.ndarray  # [3, 3] float64, accumulated normal equations
-    buoyancy_moment: np.ndarray  # [3] float64, their right-hand side
+    buoyancy_weight: np.ndarray  # [] float64, observations so far
+    buoyancy_moment: np.ndarray  # [3] float64 m/s^2, their sum
+    buoyancy_square: np.ndarray  # [3] float64 m^2/s^4, the sum of their squares
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

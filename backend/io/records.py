@@ -18,6 +18,7 @@ import numpy as np
 from backend.contract.errors import BackendError
 from backend.contract.units import STAGE_FORMAT_VERSION
 from backend.io.atomic import storage_errors, whole_file, write_text
+from backend.io.hdf5_file import whole_hdf5
 
 Record = TypeVar("Record")
 
@@ -41,7 +42,9 @@ class RecordFolder(Generic[Record]):
             count += 1
         return count
 
-    def load(self, frame: int) -> Record:
+    def __getitem__(self, frame: int) -> Record:
+        if not self._path(frame).is_file():
+            raise IndexError(frame)
         with np.load(self._path(frame), allow_pickle=False) as arrays:
             return self._type(**{name: arrays[name] for name in arrays.files})
 
@@ -84,7 +87,7 @@ class RecordFile(Generic[Record]):
 
 def write_records(path: Path, fingerprint: str, records: Iterable[Any]) -> None:
     """Pack records into one file, whole or absent."""
-    with whole_file(path) as part, h5py.File(part, "w") as file:
+    with whole_hdf5(path) as file:
         count = 0
         for record in records:
             group = file.create_group(f"{count:06d}")

@@ -1,0 +1,116 @@
+"""The look of the smoke, frame by frame: Gaussians brought to explain what a view shows.
+
+Masses by expectation-maximisation on the optical depth, held to what was carried along; unexplained smoke is born at
+the prior's depth; then gradient steps on colour and opacity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from backend.contract.job import VisualConfig
+from backend.fit import depth_prior, explain
+from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
+from backend.fit.refine import as_gaussians, refine
+from backend.fit.scene import Scene, optical_depth
+from backend.fit.state import VisualRecord
+from backend.render import splat as renderer
+
+SCALE_SHARE = 0.6  # standard deviation of a particle at birth, share of the mean spacing
+DEATH_SHARE = 0.02  # of a particle's own share of the smoke: below it a particle is spent
+BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fill detail
+
+
+class Appearance:
+    """Fits Gaussians to frames of one scene."""
+
+    def __init__(self, scene: Scene, layers: Sequence[np.ndarray], config: VisualConfig, seed: int) -> None:
+        self.scene = scene
+        self.layers = layers
+        self.config = config
+        self.seed = seed
+        masses = [frame_mass(scene, layers[frame], frame) for frame in range(len(layers))]
+        fullest = int(np.argmax(masses))
+        self.unit_mass = max(masses[fullest], 1e-30) / config.num_particles
+        self.scale = SCALE_SHARE * self._spacing(fullest)
+
+    def _spacing(self, frame: int) -> float:
+        """Mean distance m of the particles in a frame's solid of medial balls."""
+        view, tau = self.scene.views[frame], optical_depth(self.layers[frame])
+        prior = depth_prior.inflate(tau, view, self.scene.anchor)
+        is_smoke = tau > depth_prior.MASK_SHARE * max(float(np.percentile(tau, 99.5)), 1e-6)
+        area = pixel_mass(view, prior.center_depth)
+        volume = float((2.0 * prior.half_thickness * area)[is_smoke].sum(dtype=np.float64))
+        pixel = float(np.sqrt(area.mean()))
+        return max((volume / self.config.num_particles) ** (1.0 / 3.0), pixel)
+
+    def empty(self) -> VisualRecord:
+        return VisualRecord(
+            positions=np.zeros((0, 3)),
+            velocities=np.zeros((0, 3), np.float32),
+            scales=np.zeros(0, np.float32),
+            optical_masses=np.zeros(0, np.float32),
+            colors=np.zeros((0, 3), np.float32),
+            ids=np.zeros(0, np.int64),
+            born=np.zeros(0, np.int32),
+            next_id=np.int64(0),
+        )
+
+    def look(
+        self, record: VisualRecord, frame: int, *, consistency: float | None = None
+    ) -> tuple[VisualRecord, float]:
+        """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
+        config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
+        target = optical_depth(layer)
+        kept = config.consistency if consistency is None else consistency
+        record = self._weighed(record, frame, target, consistency=kept)
+        record = self._births(record, frame, target)
+        record = self._weighed(record, frame, target, consistency=0.0)
+        if config.iterations == 0:
+            return record, 0.0
+        return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale)
+
+    def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
+        """Masses after the frame was seen, without the spent and the departed."""
+        view = self.scene.views[frame]
+        splat = renderer.forward(as_gaussians(record), view)
+        _, masses = explain.fit_masses(
+            splat,
+            record.optical_masses,
+            target,
+            iterations=self.config.mass_iterations,
+            consistency=consistency,
+        )
+        is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
+        return take(replace(record, optical_masses=masses), is_kept)
+
+    def _births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
+        """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
+        view, layer = self.scene.views[frame], self.layers[frame]
+        splat = renderer.forward(as_gaussians(record), view)
+        missing = explain.missing_depth(splat, target)
+        missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
+        prior = depth_prior.inflate(target, view, self.scene.anchor)
+        mass = missing * pixel_mass(view, prior.center_depth)
+        unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
+        total = float(mass.sum(dtype=np.float64))
+        count = min(int(total / unit), self.config.num_particles - len(record.positions))
+        points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=self.seed + 104729 * frame + 1)
+        if len(points) == 0:
+            return record
+        rows, columns = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
+        seen = layer[rows, columns]
+        colors = seen[:, :3] / np.maximum(seen[:, 3:], 0.02)
+        count = len(points)
+        return join(
+            record,
+            positions=points,
+            velocities=np.zeros((count, 3)),
+            scales=np.full(count, self.scale),
+            optical_masses=np.full(count, total / count),
+            colors=colors,
+            born=np.full(count, frame),
+        )

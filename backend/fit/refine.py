@@ -1,0 +1,108 @@
+"""Gradient refinement of Gaussians against one frame: positions, scales, masses, colours together, by Adam.
+
+Loss: mean squared error of premultiplied colour and opacity, which is what input-view PSNR measures, plus a pull of
+each position to where the flow carried it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from backend.fit.state import VisualRecord
+from backend.geometry.camera import View
+from backend.render import splat as renderer
+from backend.render.composite import composite, composite_backward
+from backend.render.gaussians import Gaussians
+
+POSITION_STEP = 0.10  # of the own scale, an iteration
+LOG_STEP = 0.06  # of log mass, an iteration
+LOG_SCALE_STEP = 0.02
+COLOR_STEP = 0.02
+POSITION_PULL = 0.05  # strength of the pull to the carried position, in units of the data term's own gradient
+SCALE_RANGE = (0.5, 2.0)  # of the scale at birth
+
+
+@dataclass(slots=True)
+class _Adam:
+    """Kingma & Ba 2015, algorithm 1, for one array."""
+
+    step_size: float | np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    count: int = 0
+
+    @classmethod
+    def like(cls, array: np.ndarray, step_size: float | np.ndarray) -> _Adam:
+        return cls(step_size, np.zeros_like(array, np.float64), np.zeros_like(array, np.float64))
+
+    def change(self, gradient: np.ndarray) -> np.ndarray:
+        self.count += 1
+        self.first = 0.9 * self.first + 0.1 * gradient
+        self.second = 0.99 * self.second + 0.01 * gradient * gradient
+        mean = self.first / (1.0 - 0.9**self.count)
+        spread = np.sqrt(self.second / (1.0 - 0.99**self.count))
+        return -self.step_size * mean / (spread + 1e-12 + 1e-3 * float(spread.mean()))
+
+
+def as_gaussians(record: VisualRecord) -> Gaussians:
+    """The record as the renderer knows it."""
+    return Gaussians.isotropic(record.positions, record.scales, record.optical_masses, record.colors)
+
+
+def refine(
+    record: VisualRecord,
+    layer: np.ndarray,  # [H, W, 4] premultiplied linear RGB and opacity
+    view: View,
+    *,
+    iterations: int,
+    reference_scale: float,  # m, the scale of a particle at birth
+) -> tuple[VisualRecord, float]:
+    """The refined record and the loss before the last step."""
+    target = np.ascontiguousarray(np.moveaxis(layer, -1, 0), np.float32)
+    carried = record.positions
+    scales = record.scales.astype(np.float64)
+    log_masses = np.log(np.maximum(record.optical_masses.astype(np.float64), 1e-30))
+    colors = record.colors.astype(np.float64)
+    positions = carried.copy()
+    adam = {
+        "positions": _Adam.like(positions, POSITION_STEP * reference_scale),
+        "scales": _Adam.like(scales, LOG_SCALE_STEP),
+        "masses": _Adam.like(log_masses, LOG_STEP),
+        "colors": _Adam.like(colors, COLOR_STEP),
+    }
+    loss = 0.0
+    for _ in range(iterations):
+        current = replace(
+            record,
+            positions=positions,
+            scales=scales.astype(np.float32),
+            optical_masses=np.exp(log_masses).astype(np.float32),
+            colors=colors.astype(np.float32),
+        )
+        splat = renderer.forward(as_gaussians(current), view, features=current.colors)
+        shown = composite(splat.image)  # [4, H, W]
+        residual = shown - target
+        loss = float(np.mean(np.square(residual, dtype=np.float64)))
+        gradients = renderer.backward(splat, composite_backward(splat.image, residual))
+        pull = (positions - carried) / reference_scale
+        slope = np.asarray(gradients.positions, np.float64)
+        slope = slope + POSITION_PULL * float(np.abs(slope).mean()) * pull
+        positions = positions + adam["positions"].change(slope)
+        scale_slope = np.asarray(gradients.scales, np.float64).sum(axis=1) * scales
+        scales = np.clip(
+            scales * np.exp(adam["scales"].change(scale_slope)),
+            SCALE_RANGE[0] * reference_scale,
+            SCALE_RANGE[1] * reference_scale,
+        )
+        log_masses = log_masses + adam["masses"].change(np.asarray(gradients.optical_masses) * np.exp(log_masses))
+        colors = np.maximum(colors + adam["colors"].change(np.asarray(gradients.features, np.float64)), 0.0)
+    refined = replace(
+        record,
+        positions=positions,
+        scales=scales.astype(np.float32),
+        optical_masses=np.exp(log_masses).astype(np.float32),
+        colors=colors.astype(np.float32),
+    )
+    return refined, loss

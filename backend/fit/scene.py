@@ -1,0 +1,77 @@
+"""What every frame of a fit shares: the views at the size of the smoke layer, the time step, where the smoke stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from backend.contract.cameras import Cameras
+from backend.geometry.camera import View, view_at
+
+MAX_OPACITY = 0.99  # an 8-bit frame cannot tell more: beyond it optical depth is a guess
+MIN_PARALLAX = 0.02  # share of the mean squared sine between rays below which they do not meet anywhere in particular
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Views of all frames at the smoke layer's size, seconds a frame, and a point that the smoke rises from."""
+
+    views: tuple[View, ...]
+    seconds_per_frame: float
+    anchor: np.ndarray  # [3] m
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.views)
+
+
+def make_scene(layers: Sequence[np.ndarray], cameras: Cameras) -> Scene:
+    """layers: [H, W, 4] premultiplied linear RGB and opacity, one a frame."""
+    height, width = layers[0].shape[:2]
+    views = tuple(view_at(cameras, frame, size=(width, height)) for frame in range(len(layers)))
+    anchor = _standing_point(views[0]) if cameras.is_still else _meeting_point(layers, views)
+    return Scene(views=views, seconds_per_frame=1.0 / cameras.fps, anchor=anchor)
+
+
+def optical_depth(layer: np.ndarray) -> np.ndarray:
+    """tau = -log(1 - opacity) [H, W] of a smoke layer [H, W, 4]."""
+    return -np.log1p(-np.clip(layer[..., 3], 0.0, MAX_OPACITY)).astype(np.float32)
+
+
+def _standing_point(view: View) -> np.ndarray:
+    """One view tells no depth: the smoke stands where the optical axis passes the world's origin."""
+    forward = view.camera_to_world[:3, 2]
+    distance = float(forward @ -view.position)
+    if distance <= 0.0:
+        distance = 10.0
+    return view.position + distance * forward
+
+
+def _meeting_point(layers: Sequence[np.ndarray], views: tuple[View, ...]) -> np.ndarray:
+    """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 32 frames.
+
+    The foot (the lowest fifth of the smoke) is taken because a source stands still while the plume drifts.
+    """
+    normal, moment = np.zeros((3, 3)), np.zeros(3)
+    total = 0.0
+    for frame in np.unique(np.linspace(0, len(views) - 1, 32).astype(int)):
+        view, tau = views[frame], optical_depth(layers[frame])
+        weight = tau.sum(axis=1, dtype=np.float64)
+        if weight.sum() <= 0.0:
+            continue
+        below = np.cumsum(weight[::-1])[::-1]  # smoke at and below each row
+        foot = np.where((below <= 0.2 * below[0])[:, None], tau, 0.0).astype(np.float64)
+        if foot.sum() <= 0.0:
+            continue
+        rows, columns = np.mgrid[0 : tau.shape[0], 0 : tau.shape[1]]
+        pixel = np.array([(foot * columns).sum(), (foot * rows).sum()]) / foot.sum() + 0.5
+        ray = view.unproject(pixel[None], np.ones(1))[0] - view.position
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        moment += across @ view.position
+        total += 1.0
+    if total == 0.0 or np.linalg.eigvalsh(normal)[0] < MIN_PARALLAX * total:
+        return _standing_point(views[0])
+    return np.linalg.solve(normal, moment)

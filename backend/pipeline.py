@@ -1,0 +1,255 @@
+"""The pipeline: alone knows the order of the stages, alone reads and writes their files, resumes and stops.
+
+video -> frames -> smoke layer -> cameras -> physical particles -> visual particles -> forecast -> export
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from backend.contract import events, running
+from backend.contract.cameras import Cameras, read_cameras
+from backend.contract.errors import BackendError
+from backend.contract.job import Config, Job, read_job
+from backend.contract.result import Result
+from backend.events_out import EventSink, StageReport, StopRequest
+from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.io import images
+from backend.io.atomic import storage_errors, whole_file, write_text
+from backend.io.hdf5_file import whole_hdf5
+from backend.io.frame_stack import FrameStack, FrameStackWriter
+from backend.io.job_folder import JobFolder, file_fingerprint, fingerprint
+from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_stamp, stamp, write_records
+from backend.io.video import Clip, open_clip
+from backend.stages import cameras as cameras_stage
+from backend.stages import forecast, frames, physical, smoke, visual
+
+STAGES = ("frames", "smoke", "cameras", "physical", "visual", "forecast", "export")
+
+
+def run_job(path: Path, sink: EventSink, stop: StopRequest) -> Result:
+    """Run the job in a folder to its end, taking up what is there. Raises BackendError, Cancelled."""
+    folder = JobFolder(path)
+    job = read_job(folder.job)
+    folder.create()
+    other = running.running_pid(path)
+    if other is not None:
+        raise BackendError(
+            "job_running",
+            f"Another backend (process {other}) is at work in {path}.",
+            hint="Wait for it, cancel it, or choose another job folder.",
+        )
+    with storage_errors(folder.path):
+        running.mark_running(path)
+    pipeline = Pipeline(folder, job, sink, stop)
+    try:
+        return pipeline.run()
+    except BackendError as error:
+        error.stage = error.stage or pipeline.stage or None
+        raise
+    finally:
+        running.unmark_running(path)
+
+
+class Pipeline:
+    """One run of one job. Each method is one arrow of the data flow and returns the fingerprint of what it made."""
+
+    def __init__(self, folder: JobFolder, job: Job, sink: EventSink, stop: StopRequest) -> None:
+        self.folder = folder
+        self.job = job
+        self.config: Config = job.config()
+        self.sink = sink
+        self.stop = stop
+        self.stage = ""
+        self.seconds: dict[str, float] = {}
+
+    def run(self) -> Result:
+        given = None if self.job.cameras is None else read_cameras(self.job.cameras)
+        with open_clip(self.job.video, frame_rate=self.config.frames.frame_rate) as clip:
+            source = clip.fingerprint
+            frames_mark = self._frames(clip)
+            smoke_mark = self._smoke(frames_mark, has_alpha=clip.has_alpha)
+            cameras_mark = self._cameras(smoke_mark, given)
+        physical_mark = self._physical(smoke_mark, cameras_mark)
+        visual_mark = self._visual(smoke_mark, cameras_mark, physical_mark)
+        forecast_mark = self._forecast(smoke_mark, cameras_mark, visual_mark)
+        result = self._export(source, cameras_mark, visual_mark, forecast_mark)
+        write_text(self.folder.timing, json.dumps(self.seconds, indent=2))
+        return result
+
+    def _frames(self, clip: Clip) -> str:
+        config = self.config.frames
+        start, stop = frames.frame_range(clip, self.job.frame_start, self.job.frame_stop)
+        mark = fingerprint("frames", config, clip.fingerprint, str(start), str(stop))
+
+        def write(report: StageReport) -> None:
+            width, height = frames.working_size(clip, config)
+            with whole_hdf5(self.folder.frames) as file:
+                stack = FrameStackWriter(file, "frames", stop - start, (height, width, 4))
+                for image in frames.run(clip, config, report, frame_start=start, frame_stop=stop):
+                    stack.append(image)
+                file.attrs["fps"] = clip.fps
+                file.attrs["frame_start"] = start
+                stamp(file, mark)
+
+        self._stage("frames", mark, read_stamp(self.folder.frames), write)
+        return mark
+
+    def _smoke(self, frames_mark: str, *, has_alpha: bool) -> str:
+        config = self.config.extraction
+        given = [file_fingerprint(p) if p else None for p in (config.clean_plate, config.garbage_matte, config.smoke_mask)]
+        mark = fingerprint("smoke", config, frames_mark, str(has_alpha), *given)
+
+        def write(report: StageReport) -> None:
+            with open_stage_file(self.folder.frames) as source:
+                stack = FrameStack(source, "frames")
+                layer = smoke.run(stack, config, report, has_alpha=has_alpha)
+                self.folder.plate.unlink(missing_ok=True)
+                if layer.plate is not None:
+                    with whole_file(self.folder.plate) as part:
+                        images.write_png(part, layer.plate)
+                with whole_hdf5(self.folder.smoke) as file:
+                    out = FrameStackWriter(file, "smoke", len(stack), stack.shape)
+                    for image in layer.frames:
+                        out.append(image)
+                    for name in ("fps", "frame_start"):
+                        file.attrs[name] = source.attrs[name]
+                    file.attrs["mode"] = layer.mode
+                    file.attrs["reason"] = layer.reason
+                    file.attrs["measured"] = json.dumps(layer.measured, sort_keys=True)
+                    file.attrs["smoke_color"] = np.asarray(layer.smoke_color, np.float32)
+                    stamp(file, mark)
+
+        self._stage("smoke", mark, read_stamp(self.folder.smoke), write)
+        return mark
+
+    def _cameras(self, smoke_mark: str, given: Cameras | None) -> str:
+        mark = fingerprint("cameras", self.config.cameras, smoke_mark, given.to_json() if given else None)
+
+        def write(report: StageReport) -> None:
+            with open_stage_file(self.folder.frames) as source, open_stage_file(self.folder.smoke) as layer:
+                stack, layers = FrameStack(source, "frames"), FrameStack(layer, "smoke")
+                solved = cameras_stage.run(
+                    num_frames=len(stack),
+                    frame_start=int(source.attrs["frame_start"]),  # type: ignore[arg-type]
+                    size=(stack.shape[1], stack.shape[0]),
+                    fps=float(source.attrs["fps"]),  # type: ignore[arg-type]
+                    config=self.config.cameras,
+                    given=given,
+                    motion=lambda: cameras_stage.measure_motion(stack, report, smoke=layers),
+                    report=report,
+                )
+            data = {**json.loads(solved.to_json()), "fingerprint": mark}
+            write_text(self.folder.cameras, json.dumps(data, allow_nan=False))
+
+        self._stage("cameras", mark, _json_entry(self.folder.cameras, "fingerprint"), write)
+        return mark
+
+    def _physical(self, smoke_mark: str, cameras_mark: str) -> str:
+        mark = fingerprint("physical", self.config.physical, str(self.config.seed), smoke_mark, cameras_mark)
+
+        def write(report: StageReport) -> None:
+            with open_stage_file(self.folder.smoke) as file:
+                layers = FrameStack(file, "smoke")
+                parts = RecordFolder(self.folder.physical.with_suffix(".parts"), mark, PhysicalRecord)
+                records = physical.run(
+                    layers, read_cameras(self.folder.cameras), self.config.physical, report,
+                    seed=self.config.seed, done=parts,
+                )  # fmt: skip
+                _keep(parts, records)
+            write_records(self.folder.physical, mark, parts)
+            parts.remove()
+
+        self._stage("physical", mark, read_stamp(self.folder.physical), write)
+        return mark
+
+    def _visual(self, smoke_mark: str, cameras_mark: str, physical_mark: str) -> str:
+        mark = fingerprint("visual", self.config.visual, str(self.config.seed), smoke_mark, cameras_mark, physical_mark)
+
+        def write(report: StageReport) -> None:
+            with open_stage_file(self.folder.smoke) as file, RecordFile(self.folder.physical, PhysicalRecord) as fluid:
+                layers = FrameStack(file, "smoke")
+                parts = RecordFolder(self.folder.visual.with_suffix(".parts"), mark, VisualRecord)
+                records = visual.run(
+                    layers, read_cameras(self.folder.cameras), fluid, self.config.visual, report,
+                    seed=self.config.seed, done=parts,
+                )  # fmt: skip
+                _keep(parts, records)
+            write_records(self.folder.visual, mark, parts)
+            parts.remove()
+
+        self._stage("visual", mark, read_stamp(self.folder.visual), write)
+        return mark
+
+    def _forecast(self, smoke_mark: str, cameras_mark: str, visual_mark: str) -> str:
+        config = (self.config.forecast, self.config.visual)
+        mark = fingerprint("forecast", [asdict(part) for part in config], str(self.config.seed), smoke_mark, cameras_mark, visual_mark)
+
+        def write(report: StageReport) -> None:
+            with (
+                open_stage_file(self.folder.smoke) as file,
+                RecordFile(self.folder.physical, PhysicalRecord) as fluid,
+                RecordFile(self.folder.visual, VisualRecord) as seen,
+            ):
+                layers = FrameStack(file, "smoke")
+                records = forecast.run(
+                    layers, read_cameras(self.folder.cameras), fluid[len(fluid) - 1], seen[len(seen) - 1], config, report,
+                    seed=self.config.seed,
+                )  # fmt: skip
+                write_records(self.folder.forecast, mark, records)
+
+        self._stage("forecast", mark, read_stamp(self.folder.forecast), write)
+        return mark
+
+    def _export(self, source: str, cameras_mark: str, visual_mark: str, forecast_mark: str) -> Result:
+        raise NotImplementedError
+
+    # -- bookkeeping ----------------------------------------------------------------------------------------------
+
+    def _stage(self, name: str, mark: str, found: str | None, write: Callable[[StageReport], None]) -> None:
+        """Announce a stage, and do it unless its file is there. A stage that is done anew ends the old result."""
+        self.stop.check()
+        self.stage = name
+        is_done = found == mark
+        self.sink.send(events.Stage(name=name, index=STAGES.index(name), count=len(STAGES), skipped=is_done))
+        kept = _json_entry(self._warnings_path, name)
+        if is_done:
+            for entry in kept or []:
+                self.sink.send(events.Warning(**entry))
+            return
+        self.folder.result.unlink(missing_ok=True)
+        report = StageReport(name, self.sink, self.stop)
+        began = time.monotonic()
+        with storage_errors(self.folder.path):
+            write(report)
+            self.seconds[name] = round(time.monotonic() - began, 3)
+            write_text(self._warnings_path, json.dumps({**self._all_warnings(), name: report.warnings}))
+
+    @property
+    def _warnings_path(self) -> Path:
+        return self.folder.stages / "warnings.json"
+
+    def _all_warnings(self) -> dict[str, list[dict[str, str]]]:
+        return {name: _json_entry(self._warnings_path, name) or [] for name in STAGES}
+
+
+def _keep(parts: RecordFolder[Any], records: Iterator[Any]) -> None:
+    """Store each frame as it comes, behind those that are there."""
+    for frame, record in enumerate(records, start=len(parts)):
+        parts.save(frame, record)
+
+
+def _json_entry(path: Path, name: str) -> Any:
+    """One entry of a JSON file; None if there is no such file or entry, or it is damaged (it is then made anew)."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return data.get(name) if isinstance(data, dict) else None

@@ -1,0 +1,52 @@
+"""Particles to pictures: smoke on black, premultiplied, with its opacity."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from backend.contract.cameras import Cameras
+from backend.geometry.camera import View, view_at
+from backend.io import images
+from backend.io.atomic import whole_file
+from backend.io.particles import ParticleFrame, Particles
+from backend.render import splat as renderer
+from backend.render.composite import composite
+from backend.render.gaussians import Gaussians
+from backend.reporting import Report
+
+
+def picture(frame: ParticleFrame, view: View) -> np.ndarray:
+    """[H, W, 4] float32: linear premultiplied RGB and opacity of a frame's particles in a view."""
+    gaussians = (
+        Gaussians.isotropic(frame.positions, frame.scales, frame.optical_masses, frame.colors)
+        if frame.rotations is None
+        else Gaussians(
+            positions=frame.positions,
+            scales=frame.scales,
+            rotations=frame.rotations,
+            optical_masses=frame.optical_masses,
+            colors=frame.colors,
+        )
+    )
+    splat = renderer.forward(gaussians, view, features=frame.colors)
+    return np.ascontiguousarray(np.moveaxis(composite(splat.image), 0, -1))
+
+
+def render_frames(
+    particles: Particles,
+    cameras: Cameras,
+    wanted: list[tuple[int, int]],  # video frame, index of its camera
+    folder: Path,
+    report: Report,
+    *,
+    frame_start: int,
+) -> None:
+    """Write %04d.png, named by video frame number from 0."""
+    for step, (frame, camera) in enumerate(wanted):
+        report.progress(step, len(wanted))
+        image = picture(particles.frame(frame - frame_start), view_at(cameras, camera))
+        with whole_file(folder / f"{frame:04d}.png") as part:
+            images.write_png(part, image)
+    report.progress(len(wanted), len(wanted))

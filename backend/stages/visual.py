@@ -1,0 +1,43 @@
+"""Visual particles: what the smoke looks like. Gaussians that ride on the physical particles, fitted frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from backend.contract.cameras import Cameras
+from backend.contract.job import VisualConfig
+from backend.fit.appearance import Appearance
+from backend.fit.carry import carry, with_velocities
+from backend.fit.scene import make_scene
+from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.reporting import Report
+
+
+def run(
+    layers: Sequence[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
+    cameras: Cameras,
+    fluid: Sequence[PhysicalRecord],
+    config: VisualConfig,
+    report: Report,
+    *,
+    seed: int,
+    done: Sequence[VisualRecord],
+) -> Iterator[VisualRecord]:
+    """Yields the records of the frames behind those that are `done`."""
+    scene = make_scene(layers, cameras)
+    appearance = Appearance(scene, layers, config, seed)
+    first = len(done)
+    record = done[first - 1] if first else None
+    loss = 0.0
+    for frame in range(first, len(layers)):
+        report.progress(frame, len(layers), loss=loss)
+        if record is None:
+            record = appearance.empty()
+        else:
+            record = carry(record, fluid[frame], seconds=scene.seconds_per_frame)
+        record, loss = appearance.look(record, frame)
+        record = with_velocities(record, fluid[frame])
+        yield record
+    report.progress(len(layers), len(layers), loss=loss)

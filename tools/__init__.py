@@ -1,0 +1,1 @@
+"""What a checkout does beside the backend: the demo, the package."""
