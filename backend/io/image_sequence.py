@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
 from collections.abc import Iterator
@@ -37,8 +38,12 @@ class ImageSequence:
                 self._check_size(file, *size)
         self.has_alpha = self._find_alpha(first)
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> str:
         return content_fingerprint(self._files)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
@@ -136,7 +141,7 @@ def _numbered(folder: Path, prefix: str, rest: str) -> dict[int, Path]:
 
 def _in_order(found: dict[int, Path], name: str) -> list[Path]:
     numbers = sorted(found)
-    missing = next((a + 1 for a, b in zip(numbers, numbers[1:], strict=False) if b != a + 1), None)
+    missing = next((a + 1 for a, b in itertools.pairwise(numbers) if b != a + 1), None)
     if missing is not None:
         raise BackendError(
             "sequence_gap",

@@ -11,6 +11,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.error import FFmpegError
 
 from backend.contract.errors import BackendError
 
@@ -127,5 +128,5 @@ def _read_exr(path: Path) -> np.ndarray | None:
             frame = next(container.decode(video=0))
             has_alpha = any(component.is_alpha for component in frame.format.components)
             return frame.to_ndarray(format="gbrapf32le" if has_alpha else "gbrpf32le")
-    except (av.FFmpegError, StopIteration, IndexError):
+    except (FFmpegError, StopIteration, IndexError):
         return None

@@ -21,7 +21,10 @@ MIN_SIDE = 16  # px; below this there is nothing to track
 
 
 class Clip(Protocol):
-    """What every kind of clip offers. has_alpha: some pixel is not opaque. frame_rate: 0 takes it from the file."""
+    """What every kind of clip offers. width, height px; fps frames a second; has_alpha: some pixel is not opaque.
+
+    fingerprint: names the content; the same bytes give the same text, wherever they lie.
+    """
 
     name: str
     width: int
@@ -32,9 +35,7 @@ class Clip(Protocol):
     bit_depth: int
 
     @property
-    def fingerprint(self) -> str:
-        """Names the content: the same bytes give the same text, wherever they lie."""
-        ...
+    def fingerprint(self) -> str: ...
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Frames start to stop-1 in order, [H, W, 3 or 4] uint8 or uint16, sRGB-coded, straight alpha."""

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import av
 import numpy as np
 from av.container import InputContainer
+from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.reformatter import Colorspace
 from av.video.stream import VideoStream
@@ -68,8 +71,12 @@ class VideoFile:
         self.bit_depth = 16 if _is_deep(first) else 8
         self.height, self.width = _upright(first, has_alpha=False).shape[:2]
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> str:
         return content_fingerprint([self._path])
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
@@ -113,7 +120,7 @@ class VideoFile:
     def _open(self) -> InputContainer:
         try:
             container = av.open(str(self._path))
-        except (av.FFmpegError, ValueError) as error:
+        except (FFmpegError, ValueError) as error:
             raise self._unreadable("is not a video that can be read") from error
         if container.streams.video:
             container.streams.video[0].thread_type = "AUTO"
@@ -126,13 +133,13 @@ class VideoFile:
             )
         raise self._unreadable("is not a video that can be read")
 
-    def _decoded(self) -> Iterator[VideoFrame]:
+    def _decoded(self) -> Generator[VideoFrame]:
         """All frames in order; ends at the first damage."""
         with self._open() as container:
             stream = container.streams.video[0]
             codec = _ALPHA_DECODERS.get(stream.codec_context.name) if self._may_have_alpha else None
-            decoder = av.VideoCodecContext.create(codec, "r") if codec else stream.codec_context
-            with contextlib.suppress(av.FFmpegError):
+            decoder = cast(VideoCodecContext, VideoCodecContext.create(codec, "r")) if codec else stream.codec_context
+            with contextlib.suppress(FFmpegError):
                 for packet in container.demux(stream):
                     yield from decoder.decode(packet if packet.size else None)
 
@@ -142,7 +149,7 @@ class VideoFile:
             stream = container.streams.video[0]
             if not self._may_have_alpha and stream.codec_context.name in _ONE_FRAME_A_PACKET:
                 times: list[float | None] = []
-                with contextlib.suppress(av.FFmpegError):  # the file ends inside a packet: the count tells
+                with contextlib.suppress(FFmpegError):  # the file ends inside a packet: the count tells
                     times = [_seconds(packet) for packet in container.demux(stream) if packet.size]
                 return _Scan(num_frames=len(times), fps=_mean_rate(times), has_alpha=False)
         times, has_alpha = [], False
@@ -194,10 +201,10 @@ def _is_deep(frame: VideoFrame) -> bool:
 def _upright(frame: VideoFrame, *, has_alpha: bool) -> np.ndarray:
     """[H, W, 3 or 4] uint8 or uint16, turned as the file says."""
     names = ("rgba64le", "rgba") if has_alpha else ("rgb48le", "rgb24")
-    matrix: dict[str, Colorspace] = {}
-    if frame.format.is_rgb is False and frame.colorspace == _UNSPECIFIED:
-        matrix["src_colorspace"] = Colorspace.ITU709 if frame.height >= _HD_HEIGHT else Colorspace.ITU601
-    image = frame.to_ndarray(format=names[0 if _is_deep(frame) else 1], **matrix)
+    matrix = None
+    if not frame.format.is_rgb and frame.colorspace == _UNSPECIFIED:
+        matrix = Colorspace.ITU709 if frame.height >= _HD_HEIGHT else Colorspace.ITU601
+    image = frame.reformat(format=names[0 if _is_deep(frame) else 1], src_colorspace=matrix).to_ndarray()
     quarters = round(frame.rotation / 90.0) % 4  # counter-clockwise
     return np.ascontiguousarray(np.rot90(image, quarters)) if quarters else image
 
