@@ -70,9 +70,7 @@ def chosen_device(wanted: str) -> str:
     import torch
 
     if not torch.cuda.is_available():
-        raise BackendError(
-            "no_cuda", "CUDA was asked for, but there is no CUDA device.", hint="Choose the device auto or cpu."
-        )
+        raise BackendError("no_cuda", "CUDA was asked for, but there is no CUDA device.", hint="Choose the device auto or cpu.")
     raise BackendError(
         "no_cuda", "This version computes on the CPU only.", hint="Choose the device auto or cpu; it takes minutes."
     )
@@ -145,21 +143,20 @@ def make_folder(path: Path) -> None:
 
 def export(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
     """The VDB sequence once more, at another voxel size or for other frames."""
-    from backend.contract.job import ExportConfig
     from backend.io.particles import read_particles
-    from backend.io.vdb_sequence import write_sequence
-    from backend.stages.export import run as export_frames
+    from backend.stages import export as export_stage
 
     result = read_result(options.job)
     config = override(read_job(JobFolder(options.job).job).config(), {"export.voxel_size": options.voxel_size}).export
-    assert isinstance(config, ExportConfig)
     with read_particles(options.job / result.particles) as particles:
         first, last = video_frames(options.frames, result.frame_start, particles.num_frames + particles.num_forecast)
         make_folder(options.vdb)
         sink.send(events.Stage(name="export", index=0, count=1))
         report = StageReport("export", sink, stop)
-        frames = export_frames(particles, config, report, start=first - result.frame_start, stop=last - result.frame_start)
-        write_sequence(options.vdb, frames)
+        start, end = first - result.frame_start, last - result.frame_start
+        frames = export_stage.run(particles, config, report, start=start, stop=end)
+        for _ in export_stage.write_sequence(frames, options.vdb):
+            pass
 
 
 def simulate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
@@ -176,5 +173,3 @@ def report(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> N
 
     draw_report(options.job, options.out)
     print(json.dumps({"report": str(options.out)}))
-
-

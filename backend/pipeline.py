@@ -6,6 +6,7 @@ video -> frames -> smoke layer -> cameras -> physical particles -> visual partic
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -13,23 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.errors import BackendError
 from backend.contract.job import Config, Job, read_job
 from backend.contract.result import Result
 from backend.events_out import EventSink, StageReport, StopRequest
+from backend.fit.population import buoyancy_of
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
-from backend.io.hdf5_file import whole_hdf5
 from backend.io.frame_stack import FrameStack, FrameStackWriter
+from backend.io.hdf5_file import whole_hdf5
 from backend.io.job_folder import JobFolder, file_fingerprint, fingerprint
+from backend.io.particles import ParticleFrame, Particles, ParticlesInfo, ParticlesWriter, read_particles
 from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_stamp, stamp, write_records
 from backend.io.video import Clip, open_clip
 from backend.stages import cameras as cameras_stage
-from backend.stages import forecast, frames, physical, smoke, visual
+from backend.stages import export, forecast, frames, physical, smoke, visual
 
 STAGES = ("frames", "smoke", "cameras", "physical", "visual", "forecast", "export")
 
@@ -190,7 +192,9 @@ class Pipeline:
 
     def _forecast(self, smoke_mark: str, cameras_mark: str, visual_mark: str) -> str:
         config = (self.config.forecast, self.config.visual)
-        mark = fingerprint("forecast", [asdict(part) for part in config], str(self.config.seed), smoke_mark, cameras_mark, visual_mark)
+        mark = fingerprint(
+            "forecast", [asdict(part) for part in config], str(self.config.seed), smoke_mark, cameras_mark, visual_mark
+        )
 
         def write(report: StageReport) -> None:
             with (
@@ -209,7 +213,93 @@ class Pipeline:
         return mark
 
     def _export(self, source: str, cameras_mark: str, visual_mark: str, forecast_mark: str) -> Result:
-        raise NotImplementedError
+        mark = fingerprint("export", self.config.export, source, cameras_mark, visual_mark, forecast_mark)
+
+        def write(report: StageReport) -> None:
+            self._write_particles(source, visual_mark, forecast_mark)
+            self.sink.send(events.Artifact(kind="particles", path=PARTICLES_FILE))
+            with read_particles(self.folder.particles) as particles:
+                plan = export.plan_export(particles, self.config.export, report)
+                existing = self._prepare_sequence(mark)
+                frames_out = export.run(particles, self.config.export, report, plan=plan, existing=existing)
+                for frame, path in export.write_sequence(frames_out, self.folder.vdb):
+                    self.sink.send(events.Artifact(kind="vdb", path=f"{VDB_FOLDER}/{path.name}", frame=frame))
+                result = self._result(particles, plan, mark)
+            write_text(self.folder.result, result.to_json())
+
+        found = _json_entry(self.folder.result, "fingerprint")
+        self._stage("export", mark, found, write)
+        return read_result(self.folder.path)
+
+    def _write_particles(self, source: str, visual_mark: str, forecast_mark: str) -> None:
+        """particles.h5 from the records of the fit and the forecast; left alone when it follows from them already."""
+        mark = fingerprint("particles", None, visual_mark, forecast_mark)
+        if _particles_fingerprint(self.folder.particles) == mark:
+            return
+        with (
+            RecordFile(self.folder.physical, PhysicalRecord) as fluid,
+            RecordFile(self.folder.visual, VisualRecord) as seen,
+            RecordFile(self.folder.forecast, VisualRecord) as ahead,
+            ParticlesWriter(self.folder.particles) as writer,
+        ):
+            for record in seen:
+                writer.append(_particle_frame(record))
+            for record in ahead:
+                writer.append(_particle_frame(record), is_forecast=True)
+            last = fluid[len(fluid) - 1]
+            learned = buoyancy_of(last)
+            with open_stage_file(self.folder.smoke) as file:
+                frame_start = int(file.attrs["frame_start"])  # type: ignore[arg-type]
+            info = ParticlesInfo(
+                cameras=read_cameras(self.folder.cameras),
+                gravity=(0.0, 0.0, -9.81),
+                frame_start=frame_start,
+                buoyancy=learned[0],
+                buoyancy_uncertainty=learned[1],
+                fluid={
+                    "smoothing_length_m": float(last.smoothing_length),
+                    "rest_density": float(last.rest_density),
+                    "drag_per_second": self.config.physical.drag,
+                },
+                provenance={
+                    "program": f"wildsmoke {__version__}",
+                    "source_fingerprint": source,
+                    "preset": self.job.preset,
+                    "settings": asdict(self.config),
+                },
+                fingerprint=mark,
+            )
+            writer.finish(info)
+
+    def _prepare_sequence(self, mark: str) -> set[int]:
+        """The frames of the VDB sequence that are there already; those of another export are removed first."""
+        note = self.folder.vdb / "sequence.json"
+        if _json_entry(note, "fingerprint") != mark:
+            shutil.rmtree(self.folder.vdb, ignore_errors=True)
+            self.folder.vdb.mkdir()
+            write_text(note, json.dumps({"fingerprint": mark}))
+        paths = self.folder.vdb.glob("smoke_*.vdb")
+        return {int(path.stem.rpartition("_")[2]) - 1 for path in paths}
+
+    def _result(self, particles: Particles, plan: export.ExportPlan, mark: str) -> Result:
+        warnings = [entry for entries in self._all_warnings().values() for entry in entries]
+        return Result(
+            particles=PARTICLES_FILE,
+            cameras=CAMERAS_FILE,
+            vdb_folder=VDB_FOLDER,
+            num_frames=particles.num_frames,
+            num_forecast=particles.num_forecast,
+            frame_start=particles.info.frame_start,
+            fps=particles.info.cameras.fps,
+            voxel_size=plan.voxel_size,
+            has_color=plan.has_color,
+            smoke_color=plan.smoke_color,
+            bounds=plan.bounds,
+            buoyancy=particles.info.buoyancy,
+            background_plate=self.folder.plate.name if self.folder.plate.is_file() else None,
+            warnings=warnings,
+            fingerprint=mark,
+        )
 
     # -- bookkeeping ----------------------------------------------------------------------------------------------
 
@@ -253,3 +343,23 @@ def _json_entry(path: Path, name: str) -> Any:
     except (OSError, ValueError):
         return None
     return data.get(name) if isinstance(data, dict) else None
+
+
+def _particle_frame(record: VisualRecord) -> ParticleFrame:
+    return ParticleFrame(
+        positions=record.positions,
+        velocities=record.velocities,
+        scales=record.scales,
+        optical_masses=record.optical_masses,
+        colors=record.colors,
+        ids=record.ids,
+    )
+
+
+def _particles_fingerprint(path: Path) -> str | None:
+    """What a particles.h5 follows from; None if there is none or it cannot be read (it is then made anew)."""
+    try:
+        with read_particles(path) as particles:
+            return particles.info.fingerprint
+    except BackendError:
+        return None

@@ -45,6 +45,7 @@ class Result:
     buoyancy: tuple[float, float, float]
     background_plate: str | None = None
     warnings: list[dict[str, str]] = field(default_factory=list)
+    fingerprint: str = ""
 
     def to_json(self) -> str:
         data = {"format_version": RESULT_FORMAT_VERSION, **dataclasses.asdict(self)}

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
@@ -59,9 +58,7 @@ class Appearance:
             next_id=np.int64(0),
         )
 
-    def look(
-        self, record: VisualRecord, frame: int, *, consistency: float | None = None
-    ) -> tuple[VisualRecord, float]:
+    def look(self, record: VisualRecord, frame: int, *, consistency: float | None = None) -> tuple[VisualRecord, float]:
         """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)

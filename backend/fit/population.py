@@ -6,14 +6,13 @@ import dataclasses
 from typing import TypeVar
 
 import numpy as np
-
 from backend.fit.depth_prior import plane_depth
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.geometry.camera import View
 
 MARGIN = 0.15  # share of the image around it in which particles live on unseen
-_PER_PARTICLE = {"positions", "velocities", "masses", "optical_masses", "scales", "colors", "ids", "born"}
+PER_PARTICLE = {"positions", "velocities", "masses", "optical_masses", "scales", "colors", "ids", "born"}
 
 AnyRecord = TypeVar("AnyRecord", PhysicalRecord, VisualRecord)
 
@@ -39,7 +38,7 @@ def is_near_image(positions: np.ndarray, view: View) -> np.ndarray:
 
 def take(record: AnyRecord, is_kept: np.ndarray) -> AnyRecord:
     """The record with some of its particles."""
-    names = {item.name for item in dataclasses.fields(record)} & _PER_PARTICLE
+    names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
     return dataclasses.replace(record, **{name: getattr(record, name)[is_kept] for name in names})
 
 
@@ -47,9 +46,24 @@ def join(record: AnyRecord, **newborn: np.ndarray) -> AnyRecord:
     """The record with newborn particles behind its own; ids and next_id are given here."""
     count = len(newborn["positions"])
     newborn["ids"] = record.next_id + np.arange(count, dtype=np.int64)
-    names = {item.name for item in dataclasses.fields(record)} & _PER_PARTICLE
+    names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
     joined = {}
     for name in names:
         old = getattr(record, name)
         joined[name] = np.concatenate([old, np.asarray(newborn[name]).astype(old.dtype)])
     return dataclasses.replace(record, **joined, next_id=np.int64(record.next_id + count))
+
+
+def buoyancy_of(record: PhysicalRecord) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """The learned buoyancy and its standard deviation, both m/s^2; infinite doubt is reported as the estimate's own size."""
+    count = float(record.buoyancy_weight)
+    if count < 2.0:
+        return _triple(record.buoyancy), _triple(np.abs(record.buoyancy))
+    mean = record.buoyancy_moment / count
+    variance = np.maximum(record.buoyancy_square / count - mean * mean, 0.0)
+    return _triple(record.buoyancy), _triple(np.sqrt(variance / (count - 1.0)))
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer

@@ -1,0 +1,100 @@
+"""A physical rollout from the last fitted frame: the fluid goes on by itself, the source goes on emitting.
+
+For looks and editing, not for prediction: wind, buoyancy and colliders are the artist's. Visual particles ride on the
+physical ones; at the source both are born again as they were during the fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from backend.contract.errors import BackendError
+from backend.contract.job import PhysicalConfig
+from backend.fit.carry import as_fluid, carry, with_velocities
+from backend.fit.population import PER_PARTICLE, join, take
+from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.physics import fluid as fluids
+from backend.reporting import Report
+
+FOOT = 0.2  # the source is the lowest fifth of the smoke's height
+REPLAYED = 24  # frames whose births the source repeats
+LIFETIME_REACH = 3.0  # heights of the smoke beyond which a particle is dropped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rollout:
+    """What the artist chose. wind m/s or None for still air; buoyancy: times the learned one; colliders: of the fluid."""
+
+    num_frames: int
+    wind: tuple[float, float, float] | None = None
+    buoyancy: float = 1.0
+    colliders: tuple = ()
+
+
+def run(
+    fluid: Sequence[PhysicalRecord],
+    seen: Sequence[VisualRecord],
+    config: PhysicalConfig,
+    rollout: Rollout,
+    report: Report,
+    *,
+    seconds: float,
+) -> Iterator[VisualRecord]:
+    """Yields rollout.num_frames records behind the last frame. seconds: of a frame."""
+    record, look = fluid[len(fluid) - 1], seen[len(seen) - 1]
+    if len(record.positions) == 0:
+        raise BackendError("nothing_to_simulate", "The last fitted frame holds no smoke.", hint="Fit other frames.")
+    parameters = fluids.derive_parameters(
+        record.positions,
+        drag=config.drag,
+        solver_iterations=config.solver_iterations,
+        max_substeps=config.max_substeps,
+    )
+    parameters = replace(
+        parameters,
+        smoothing_length=float(record.smoothing_length),
+        rest_density=float(record.rest_density),
+        buoyancy=tuple(rollout.buoyancy * record.buoyancy),
+        wind=rollout.wind or (0.0, 0.0, 0.0),
+        colliders=rollout.colliders,
+    )
+    emitted = (_births(fluid), _births(seen))
+    low, high = look.positions.min(axis=0), look.positions.max(axis=0)
+    reach = LIFETIME_REACH * float((high - low).max())
+    for step in range(rollout.num_frames):
+        report.progress(step, rollout.num_frames)
+        state, _ = fluids.step(as_fluid(record), parameters, seconds)
+        record = replace(record, positions=state.positions, velocities=state.velocities)
+        look = carry(look, record, seconds=seconds)
+        record = _born_again(record, emitted[0], step)
+        look = _born_again(look, emitted[1], step)
+        middle = 0.5 * (low + high)
+        record = take(record, np.linalg.norm(record.positions - middle, axis=1) < reach)
+        look = take(look, np.linalg.norm(look.positions - middle, axis=1) < reach)
+        yield with_velocities(look, record)
+    report.progress(rollout.num_frames, rollout.num_frames)
+
+
+def _births(records: Sequence[PhysicalRecord] | Sequence[VisualRecord]) -> list[PhysicalRecord | VisualRecord]:
+    """What was born at the foot of the smoke in each of the last frames of the fit."""
+    born = []
+    for frame in range(max(1, len(records) - REPLAYED), len(records)):
+        record = records[frame]
+        if len(record.positions) == 0:
+            continue
+        height = record.positions[:, 2]
+        is_at_foot = height <= height.min() + FOOT * (height.max() - height.min())
+        born.append(take(record, is_at_foot & (record.born == frame)))
+    return born
+
+
+def _born_again(record, births: list, step: int):
+    """The record with the newborn of a fitted frame, one frame after the other, over and over."""
+    if not births:
+        return record
+    newborn = births[step % len(births)]
+    names = {item.name for item in dataclasses.fields(newborn)} & PER_PARTICLE - {"ids"}
+    return join(record, **{name: getattr(newborn, name) for name in names})
