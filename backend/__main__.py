@@ -52,7 +52,7 @@ def guarded(work: Callable[[], None], sink: EventSink, job: Path | None) -> int:
         write_log(job, f"{error.code}: {error}")
         sink.send(events.Error(code=error.code, message=error.message, hint=error.hint, stage=error.stage))
         return EXIT_USER
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 the one place where a defect becomes an event
         text = traceback.format_exc()
         where = write_log(job, text)
         if where is None:

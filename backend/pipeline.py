@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from backend import __version__
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.errors import BackendError
 from backend.contract.job import Config, Job, read_job
-from backend.contract.result import Result
+from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.population import buoyancy_of
 from backend.fit.state import PhysicalRecord, VisualRecord

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
 from backend.contract.cameras import read_cameras
 from backend.contract.result import read_result
 from backend.fit.scene import make_scene
@@ -59,9 +58,7 @@ def draw_report(job: Path, path: Path) -> None:
 def orbit(view: View, pivot: np.ndarray, degrees: float) -> View:
     """The view from another side: turned about the upright axis through a point [3] m, its distance kept."""
     angle = math.radians(degrees)
-    turn = np.array(
-        [[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0.0, 0.0, 1.0]]
-    )
+    turn = np.array([[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     turned = np.eye(4)
     turned[:3, :3] = turn @ view.camera_to_world[:3, :3]
     turned[:3, 3] = turn @ (view.position - pivot) + pivot
