@@ -1,0 +1,48 @@
+"""The VDB sequence as a Volume object, through the data API alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...backend.contract.errors import BackendError
+from ...backend.contract.result import VDB_NAME, Result
+from .ownership import mark, owned_name
+
+
+def frame_range(result: Result) -> tuple[int, int]:
+    """First and last Blender frame: video frame 0 is Blender's frame 1; the forecast is included."""
+    first = result.frame_start + 1
+    return first, first + result.num_frames + result.num_forecast - 1
+
+
+def new_object(job: Path, collection: bpy.types.Collection) -> bpy.types.Object:
+    name = owned_name(job, "Smoke")
+    smoke = bpy.data.objects.new(name, bpy.data.volumes.new(name))
+    mark(smoke, job, "volume")
+    collection.objects.link(smoke)
+    return smoke
+
+
+def show_sequence(smoke: bpy.types.Object, job: Path, result: Result) -> None:
+    """Point the volume at the job's sequence: on frame f it shows the file numbered f - frame_start."""
+    first_file = job / result.vdb_folder / VDB_NAME.format(1)
+    if not first_file.is_file():
+        raise BackendError("vdb_missing", f"There is no {first_file}.", hint="Run the job again; it writes what is missing.")
+    data = smoke.data
+    data.filepath = str(first_file)
+    data.is_sequence = False
+    if not data.grids.load():
+        raise BackendError("vdb_damaged", f"Blender cannot read {first_file}.", hint="Delete it and run the job again.")
+    data.velocity_grid = "velocity"  # looked up in the file, so the grids must be loaded
+    data.grids.unload()
+    data.is_sequence = True
+    data.frame_start, last = frame_range(result)
+    data.frame_duration = last - data.frame_start + 1
+    data.frame_offset = 0
+    data.sequence_mode = "CLIP"
+    data.velocity_unit = "SECOND"  # the default, FRAME, would blur too little by the frame rate
+    data.velocity_scale = 1.0
+    data.render.space = "WORLD"
+    data.render.step_size = result.voxel_size
