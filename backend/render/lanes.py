@@ -7,6 +7,7 @@ array[start : start + 16] and is not checked, so rows carry at least 16 elements
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -21,6 +22,11 @@ _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _INTS = ir.VectorType(_INT, LANES)
+
+
+def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
+    """numba's intrinsic; for a type checker, whatever its arguments are (numba drops the first, `typingctx`)."""
+    return intrinsic(function)
 
 
 class LanesType(types.Type):
@@ -67,7 +73,7 @@ def _is_flat_float32(array: Any) -> bool:
     return isinstance(array, types.Array) and array.ndim == 1 and array.dtype == types.float32 and array.layout == "C"
 
 
-@intrinsic
+@_operation
 def spread(typingctx: Any, value: Any) -> Any:
     """The float32 number `value` in every lane."""
     del typingctx, value
@@ -78,7 +84,7 @@ def spread(typingctx: Any, value: Any) -> Any:
     return lanes_type(types.float32), codegen
 
 
-@intrinsic
+@_operation
 def ramp(typingctx: Any, first: Any) -> Any:
     """first, first + 1, ..., first + 15."""
     del typingctx, first
@@ -90,7 +96,7 @@ def ramp(typingctx: Any, first: Any) -> Any:
     return lanes_type(types.float32), codegen
 
 
-@intrinsic
+@_operation
 def load(typingctx: Any, array: Any, start: Any) -> Any:
     """array[start : start + 16]."""
     del typingctx, start
@@ -103,7 +109,7 @@ def load(typingctx: Any, array: Any, start: Any) -> Any:
     return lanes_type(array, types.intp), codegen
 
 
-@intrinsic
+@_operation
 def store(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
     """array[start : start + 16] = value."""
     del typingctx, start, value
@@ -117,7 +123,7 @@ def store(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
     return types.void(array, types.intp, lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def store_interleaved(typingctx: Any, array: Any, start: Any, even: Any, odd: Any) -> Any:
     """array[start : start + 32] = even[0], odd[0], even[1], odd[1], ..."""
     del typingctx, start, even, odd
@@ -134,7 +140,7 @@ def store_interleaved(typingctx: Any, array: Any, start: Any, even: Any, odd: An
     return types.void(array, types.intp, lanes_type, lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def load_stride2(typingctx: Any, array: Any, start: Any) -> Any:
     """array[start : start + 31 : 2]; touches 32 elements."""
     del typingctx, start
@@ -150,7 +156,7 @@ def load_stride2(typingctx: Any, array: Any, start: Any) -> Any:
     return lanes_type(array, types.intp), codegen
 
 
-@intrinsic
+@_operation
 def add(typingctx: Any, x: Any, y: Any) -> Any:
     """x + y."""
     del typingctx, x, y
@@ -161,7 +167,7 @@ def add(typingctx: Any, x: Any, y: Any) -> Any:
     return lanes_type(lanes_type, lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def multiply(typingctx: Any, x: Any, y: Any) -> Any:
     """x * y."""
     del typingctx, x, y
@@ -172,7 +178,7 @@ def multiply(typingctx: Any, x: Any, y: Any) -> Any:
     return lanes_type(lanes_type, lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def muladd(typingctx: Any, x: Any, y: Any, z: Any) -> Any:
     """x * y + z, in one step where the processor has one."""
     del typingctx, x, y, z
@@ -183,7 +189,7 @@ def muladd(typingctx: Any, x: Any, y: Any, z: Any) -> Any:
     return lanes_type(lanes_type, lanes_type, lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def flushed(typingctx: Any, x: Any, smallest: Any) -> Any:
     """x, with 0 in the lanes whose magnitude is below the float32 number `smallest`."""
     del typingctx, x, smallest
@@ -201,7 +207,7 @@ _EXP2 = (0.00132647, 0.00967151, 0.05550734, 0.24022242, 0.69314698, 1.0)
 _ROUND = 12582912.0  # 1.5 * 2^23: adding it leaves the nearest integer in the low bits
 
 
-@intrinsic
+@_operation
 def exponential(typingctx: Any, x: Any) -> Any:
     """exp(max(x, -30)) for x at most 0 (up to 80 in fact): 2^n times a polynomial in the fraction."""
     del typingctx, x
@@ -221,7 +227,7 @@ def exponential(typingctx: Any, x: Any) -> Any:
     return lanes_type(lanes_type), codegen
 
 
-@intrinsic
+@_operation
 def total(typingctx: Any, x: Any) -> Any:
     """Sum of the lanes, always added in the same order: halves onto each other."""
     del typingctx, x
