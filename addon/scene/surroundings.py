@@ -14,8 +14,8 @@ from .ownership import find_object, mark, owned_name
 VOLUME_BOUNCES = 4  # fewer make lit smoke dark
 
 # Light that makes a plume of albedo 0.95, lit (Relight 1), about as bright as it was filmed; found by rendering one.
-_SUN_PER_RADIANCE = 6.5  # W/m^2
-_AMBIENT_PER_RADIANCE = 0.5
+_SUN_PER_RADIANCE = 9.0  # W/m^2
+_AMBIENT_PER_RADIANCE = 0.7
 
 
 def ensure(scene: bpy.types.Scene, collection: bpy.types.Collection, job: Path, result: Result) -> None:

@@ -147,7 +147,7 @@ class ParticlesWriter:
         file.attrs["frame_start"] = info.frame_start
         file.attrs["fps"] = info.cameras.fps
         file.attrs["fingerprint"] = info.fingerprint
-        file["frames/offsets"] = np.array(self._offsets, "<i8")
+        _write_array(file.create_group("frames"), "offsets", np.array(self._offsets, "<i8"))
         self._lives.write(file.create_group("identities"), len(self._offsets) - 1)
         _write_cameras(file.create_group("cameras"), info.cameras)
         _write_physics(file.create_group("physics"), info)
@@ -300,9 +300,9 @@ class _Lives:
         self._last = np.insert(self._last, at, frame)
 
     def write(self, group: Any, num_frames: int) -> None:
-        group["ids"] = self._ids.astype("<i8")
-        group["birth_frames"] = self._births.astype("<i4")
-        group["death_frames"] = (self._last + 1).astype("<i4")  # num_frames: alive to the end
+        _write_array(group, "ids", self._ids.astype("<i8"))
+        _write_array(group, "birth_frames", self._births.astype("<i4"))
+        _write_array(group, "death_frames", (self._last + 1).astype("<i4"))  # num_frames: alive to the end
         group.attrs["num_frames"] = num_frames
 
 
@@ -326,9 +326,9 @@ def _check_frame(frame: ParticleFrame, columns: dict[str, tuple[str, tuple[int, 
 
 def _write_cameras(group: Any, cameras: Cameras) -> None:
     _write_text(group, "json", cameras.to_json())
-    group["camera_to_world"] = np.array(cameras.camera_to_world, "<f8")
-    group["intrinsics"] = np.array([cameras.fx, cameras.fy, cameras.cx, cameras.cy], "<f8")
-    group["intrinsics"].attrs["unit"] = np.bytes_(b"px: fx, fy, cx, cy")
+    _write_array(group, "camera_to_world", np.array(cameras.camera_to_world, "<f8"))
+    intrinsics = _write_array(group, "intrinsics", np.array([cameras.fx, cameras.fy, cameras.cx, cameras.cy], "<f8"))
+    intrinsics.attrs["unit"] = np.bytes_(b"px: fx, fy, cx, cy")
     group.attrs["width"], group.attrs["height"], group.attrs["fps"] = cameras.width, cameras.height, cameras.fps
 
 
@@ -343,7 +343,12 @@ def _write_physics(group: Any, info: ParticlesInfo) -> None:
 def _write_text(group: Any, name: str, text: str) -> None:
     """Text as a scalar of fixed length: any HDF5 reader shows it, and its bytes follow from the text alone."""
     data = text.encode()
-    group.create_dataset(name, data=np.array(data, dtype=h5py.string_dtype("utf-8", max(len(data), 1))))
+    _write_array(group, name, np.array(data, dtype=h5py.string_dtype("utf-8", max(len(data), 1))))
+
+
+def _write_array(group: Any, name: str, array: np.ndarray) -> Any:
+    """A small array; no time is stored with it."""
+    return group.create_dataset(name, data=array, track_times=False)
 
 
 def _read_text(group: Any, name: str, path: Path) -> str:
