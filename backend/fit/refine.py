@@ -13,7 +13,7 @@ from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer
 from backend.render.composite import composite, composite_backward
-from backend.render.gaussians import Gaussians
+from backend.render.gaussians import Gaussians, isotropic
 
 POSITION_STEP = 0.10  # of the own scale, an iteration
 LOG_STEP = 0.06  # of log mass, an iteration
@@ -47,7 +47,7 @@ class _Adam:
 
 def as_gaussians(record: VisualRecord) -> Gaussians:
     """The record as the renderer knows it."""
-    return Gaussians.isotropic(record.positions, record.scales, record.optical_masses, record.colors)
+    return isotropic(record.positions, record.scales, record.optical_masses, record.colors)
 
 
 def refine(
@@ -81,10 +81,10 @@ def refine(
             colors=colors.astype(np.float32),
         )
         splat = renderer.forward(as_gaussians(current), view, features=current.colors)
-        shown = composite(splat.image)  # [4, H, W]
-        residual = shown - target
-        loss = float(np.mean(np.square(residual, dtype=np.float64)))
-        gradients = renderer.backward(splat, composite_backward(splat.image, residual))
+        shown, opacity = composite(splat.image)  # [3, H, W], [H, W]
+        color_error, opacity_error = shown - target[:3], opacity - target[3]
+        loss = float(np.square(color_error, dtype=np.float64).mean() + np.square(opacity_error, dtype=np.float64).mean())
+        gradients = renderer.backward(splat, composite_backward(splat.image, color_error, opacity_error))
         pull = (positions - carried) / reference_scale
         slope = np.asarray(gradients.positions, np.float64)
         slope = slope + POSITION_PULL * float(np.abs(slope).mean()) * pull

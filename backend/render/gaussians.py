@@ -48,3 +48,15 @@ def require_finite(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None
         suspicious = not np.isfinite(np.sum(array, dtype=np.float64))
     if suspicious and not np.isfinite(array).all():
         raise ValueError(f"{name} holds NaN or infinity")
+
+
+def isotropic(positions: np.ndarray, scales: np.ndarray, optical_masses: np.ndarray, colors: np.ndarray | None = None) -> Gaussians:
+    """Round Gaussians: positions [N, 3] m, scales [N] m, optical_masses [N] m^2, colors [N, 3] linear (white without)."""
+    num = len(positions)
+    return Gaussians(
+        positions=positions,
+        scales=np.repeat(np.asarray(scales)[:, None], 3, axis=1),
+        rotations=np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (num, 1)),
+        optical_masses=optical_masses,
+        colors=np.ones((num, 3), np.float32) if colors is None else colors,
+    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-
 from backend.contract.cameras import Cameras
 from backend.geometry.camera import View, view_at
 from backend.io import images
@@ -13,14 +12,14 @@ from backend.io.atomic import whole_file
 from backend.io.particles import ParticleFrame, Particles
 from backend.render import splat as renderer
 from backend.render.composite import composite
-from backend.render.gaussians import Gaussians
+from backend.render.gaussians import Gaussians, isotropic
 from backend.reporting import Report
 
 
 def picture(frame: ParticleFrame, view: View) -> np.ndarray:
     """[H, W, 4] float32: linear premultiplied RGB and opacity of a frame's particles in a view."""
     gaussians = (
-        Gaussians.isotropic(frame.positions, frame.scales, frame.optical_masses, frame.colors)
+        isotropic(frame.positions, frame.scales, frame.optical_masses, frame.colors)
         if frame.rotations is None
         else Gaussians(
             positions=frame.positions,
@@ -31,7 +30,8 @@ def picture(frame: ParticleFrame, view: View) -> np.ndarray:
         )
     )
     splat = renderer.forward(gaussians, view, features=frame.colors)
-    return np.ascontiguousarray(np.moveaxis(composite(splat.image), 0, -1))
+    color, opacity = composite(splat.image)
+    return np.ascontiguousarray(np.concatenate([np.moveaxis(color, 0, -1), opacity[..., None]], axis=2))
 
 
 def render_frames(

@@ -24,7 +24,7 @@ from backend.geometry.camera import View
 from backend.physics import fluid as fluids
 from backend.physics.interpolate import interpolate_velocity, smooth
 from backend.render import splat as renderer
-from backend.render.gaussians import Gaussians
+from backend.render.gaussians import isotropic
 from backend.reporting import Report
 
 SPLAT_SHARE = 0.5  # standard deviation of a physical particle's splat, share of the smoothing length
@@ -124,7 +124,7 @@ class _Fit:
     def _splat(self, record: PhysicalRecord, frame: int) -> tuple[renderer.Splat, np.ndarray]:
         """The particles' optical depth, and the frame's own, blurred to what particles of this size can show."""
         view = self.scene.views[frame]
-        gaussians = Gaussians.isotropic(record.positions, np.full(len(record.positions), self.sigma), record.masses)
+        gaussians = isotropic(record.positions, np.full(len(record.positions), self.sigma), record.masses)
         target = optical_depth(self.layers[frame])
         distance = max(float(view.to_camera(self.scene.anchor[None])[0, 2]), 1e-6)
         blur = self.sigma * view.fx / distance

@@ -1,0 +1,104 @@
+"""The background without smoke: what stays the same over time, and a smooth fill where smoke never clears."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
+
+_MODE_SHARE = 0.25  # of the frames that must agree: smoke may cover a pixel three quarters of the time
+_MIN_NOISE = 0.5 / 255  # sRGB code; half a step of 8 bits
+_MAX_SPREAD = 4.0  # noise levels; frames that agree less than this show no background
+_BAND_VALUES = 8_000_000  # temporal statistics are taken over bands of rows of this size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CleanPlate:
+    """color: [h, w, 3] linear. is_seen: [h, w] bool, where the background showed itself; elsewhere it is filled in.
+
+    noise: of one frame, sRGB code. activity: [h, w] share of the frames that differ from the plate.
+    """
+
+    color: np.ndarray
+    is_seen: np.ndarray
+    noise: float
+    activity: np.ndarray
+
+
+def temporal_plate(samples: Sequence[np.ndarray]) -> CleanPlate:
+    """The plate of frames [h, w, 3] linear that lie on each other (NaN where a frame does not reach).
+
+    Per pixel the shortest interval that holds a quarter of the frames (the half-sample mode of Bickel & Fruehwirth
+    2006, with a quarter) is centred on the value that repeats best: the background repeats to within noise, smoke in
+    front of it does not, whether it brightens or darkens. The plate is the mean of the frames that agree with it.
+    """
+    coded = [linear_to_srgb(frame[..., :3]).astype(np.float32) for frame in samples]
+    noise = frame_noise(coded)
+    height, width = coded[0].shape[:2]
+    rows = max(1, _BAND_VALUES // (len(coded) * width * 3))
+    parts = [_band(np.stack([c[top : top + rows] for c in coded]), noise) for top in range(0, height, rows)]
+    color, is_seen, activity = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    color = fill_smoothly(color, is_seen)
+    return CleanPlate(color=srgb_to_linear(color).astype(np.float32), is_seen=is_seen, noise=noise, activity=activity)
+
+
+def frame_noise(coded: Sequence[np.ndarray]) -> float:
+    """Noise of one frame [h, w, 3], sRGB code: from differences of frames in time, of which most pixels show no smoke."""
+    spreads = [np.nanmedian(np.abs(b - a)) / (0.6745 * np.sqrt(2.0)) for a, b in zip(coded, coded[1:], strict=False)]
+    return max(float(np.median(spreads)), _MIN_NOISE)
+
+
+def _band(coded: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames [n, r, w, 3] coded -> plate [r, w, 3] coded, seen [r, w], activity [r, w]."""
+    luma = coded @ LUMINANCE
+    ordered = np.sort(luma, axis=0)  # NaN comes last
+    num = np.isfinite(luma).sum(axis=0)
+    length = max(3, round(_MODE_SHARE * len(coded)))
+    if len(coded) <= length:
+        length = max(2, len(coded) - 1)
+    widths = ordered[length - 1 :] - ordered[: len(coded) - length + 1]
+    widths = np.where(np.isfinite(widths), widths, np.inf)
+    best = widths.argmin(axis=0)[None]
+    low = np.take_along_axis(ordered, best, axis=0)
+    high = np.take_along_axis(ordered, best + length - 1, axis=0)
+    spread = (high - low)[0]
+    centre = 0.5 * (low + high)
+    agrees = np.abs(luma - centre) < np.maximum(0.5 * (high - low), 0.0) + 2.0 * noise
+    weight = agrees[..., None].astype(np.float32)
+    color = np.where(weight > 0, coded, 0.0).sum(axis=0) / np.maximum(weight.sum(axis=0), 1.0)
+    # A quarter of normally distributed values lies within 0.64 of their deviation.
+    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise)
+    differs = np.abs(coded - color).max(axis=-1) > 5.0 * noise
+    activity = differs.sum(axis=0) / np.maximum(num, 1)
+    return color.astype(np.float32), is_seen, activity.astype(np.float32)
+
+
+def fill_smoothly(image: np.ndarray, is_known: np.ndarray) -> np.ndarray:
+    """image [h, w, C] with the unknown pixels filled by averages of the known ones around them, near ones first.
+
+    Pull-push (Gortler et al. 1996, section 3.4): halve with weights until a pixel is covered, then take from there.
+    """
+    if is_known.all() or not is_known.any():
+        return image
+    weight = is_known.astype(np.float32)[..., None]
+    return np.where(is_known[..., None], image, _pull_push(image * weight, weight)).astype(image.dtype)
+
+
+def _pull_push(weighted: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    own = weighted / np.maximum(weight, 1e-6)
+    if weight.min() >= 1.0 or max(weighted.shape[:2]) == 1:
+        return own
+    size = (weighted.shape[1], weighted.shape[0])
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    gain = (size[0] * size[1]) / (half[0] * half[1])
+    w = cv2.resize(weight, half, interpolation=cv2.INTER_AREA).reshape(half[1], half[0], 1) * gain
+    c = cv2.resize(weighted, half, interpolation=cv2.INTER_AREA).reshape(half[1], half[0], -1) * gain
+    full = np.maximum(w, 1.0)
+    coarse = _pull_push(c / full, w / full)
+    coarse = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR).reshape(weighted.shape)
+    share = np.minimum(weight, 1.0)
+    return share * own + (1.0 - share) * coarse

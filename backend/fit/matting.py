@@ -1,0 +1,154 @@
+"""Opacity of smoke in front of a known background.
+
+Image formation (linear light): I = J (1 - a) + S a with background J, smoke colour S, opacity a. S varies from its lit
+to its shaded side, so it is taken as s c with a fixed colour direction c and a brightness s that is free within a spread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from backend.io.images import LUMINANCE
+
+_OPACITY_SPREAD = 1.0  # prior deviation of opacity around 0: holds it down where J and S look alike
+_ROUNDS = 3  # the spread of the brightness term depends on the opacity itself
+_MIN_COLOR_PIXELS = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmokeColor:
+    """direction: [3] linear, luminance 1. brightness, spread: of the luminance of opaque smoke."""
+
+    direction: np.ndarray
+    brightness: float
+    spread: float
+
+    @property
+    def linear(self) -> np.ndarray:  # [3]
+        return (self.brightness * self.direction).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opacity:
+    """value: [h, w] 0..1, unfiltered. deviation: [h, w] its standard deviation from noise alone.
+
+    explained: [h, w] 0..1, how much of the difference from the background smoke accounts for.
+    """
+
+    value: np.ndarray
+    deviation: np.ndarray
+    explained: np.ndarray
+
+
+def coded_noise_to_linear(background: np.ndarray, noise: float) -> np.ndarray:
+    """Noise of sRGB code, in linear light at the brightness of the background [h, w, 3]: times the slope of the curve."""
+    slope = np.where(background <= 0.0031308, 1.0 / 12.92, 2.4 / 1.055 * np.maximum(background, 0.0031308) ** (1.4 / 2.4))
+    return (noise * slope).astype(np.float32)
+
+
+def solve_opacity(
+    image: np.ndarray,  # [h, w, 3] linear
+    background: np.ndarray,  # [h, w, 3] linear
+    smoke: SmokeColor,
+    noise: float,  # sRGB code
+) -> Opacity:
+    """Least squares over channels for opacity a and smoke light u = s a:
+
+    sum_k ((a J_k - u c_k - (J_k - I_k)) / noise_k)^2 + ((u - brightness a) / (spread a))^2 + (a / opacity spread)^2.
+    For spread -> 0 this is a = (J - I).(J - S) / |J - S|^2, the transmittance formula of METHOD solved for opacity.
+    """
+    weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), noise) ** 2
+    difference = background - image
+    direction = smoke.direction.astype(np.float32)
+    jj = (weight * background * background).sum(axis=2)
+    jc = (weight * background * direction).sum(axis=2)
+    cc = (weight * direction * direction).sum(axis=2)
+    jd = (weight * background * difference).sum(axis=2)
+    cd = (weight * direction * difference).sum(axis=2)
+    opacity = np.full(image.shape[:2], 0.5, np.float32)
+    s, prior = np.float32(smoke.brightness), np.float32(1.0 / _OPACITY_SPREAD**2)
+    light = s * opacity
+    a11 = determinant = np.ones_like(opacity)
+    for _ in range(_ROUNDS):
+        pull = 1.0 / (smoke.spread * np.maximum(opacity, 0.05)) ** 2
+        a11, a12, a22 = jj + s * s * pull + prior, -jc - s * pull, cc + pull
+        determinant = np.maximum(a11 * a22 - a12 * a12, 1e-12)
+        opacity = np.clip((jd * a22 + cd * a12) / determinant, 0.0, 1.0)
+        light = np.maximum((s * pull * opacity + jc * opacity - cd) / a22, 0.0)
+    residual = (weight * (opacity[..., None] * background - light[..., None] * direction - difference) ** 2).sum(axis=2)
+    total = (weight * difference * difference).sum(axis=2)
+    explained = np.clip(1.0 - residual / np.maximum(total, 3.0), 0.0, 1.0)
+    deviation = np.sqrt(a22 / determinant)  # the inverse of the normal matrix, element a a
+    return Opacity(value=opacity, deviation=deviation.astype(np.float32), explained=explained.astype(np.float32))
+
+
+def guided_filter(value: np.ndarray, guide: np.ndarray, *, radius: int, epsilon: float) -> np.ndarray:
+    """value [h, w] smoothed along the structures of guide [h, w]. He, Sun & Tang 2010, eq. 5, 6 and 8."""
+    if radius < 1:
+        return value
+    size = (2 * radius + 1, 2 * radius + 1)
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return cv2.blur(x.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
+
+    mean_guide, mean_value = mean(guide), mean(value)
+    covariance = mean(guide * value) - mean_guide * mean_value
+    variance = mean(guide * guide) - mean_guide**2
+    slope = covariance / (np.maximum(variance, 0.0) + epsilon)
+    offset = mean_value - slope * mean_guide
+    return np.clip(mean(slope) * guide + mean(offset), 0.0, 1.0).astype(np.float32)
+
+
+def hysteresis(
+    opacity: np.ndarray,  # [h, w]
+    *,
+    low: np.ndarray | float,  # below it nothing is kept; a soft ramp up to twice it
+    high: float,  # a connected region must reach it
+    min_pixels: int = 9,
+) -> np.ndarray:
+    """[h, w] 0..1: what to keep of an opacity. Regions that stay below `high`, or are specks, go."""
+    num, labels, stats, _ = cv2.connectedComponentsWithStats((opacity > low).astype(np.uint8), connectivity=8)
+    reaches = np.zeros(num, np.int64)
+    np.add.at(reaches, labels[opacity > high], 1)
+    is_kept = (reaches >= max(1, min_pixels // 3)) & (stats[:, cv2.CC_STAT_AREA] >= min_pixels)
+    is_kept[0] = False
+    ramp = np.clip(opacity / np.maximum(low, 1e-6) - 1.0, 0.0, 1.0)
+    return np.where(is_kept[labels], ramp, 0.0).astype(np.float32)
+
+
+def estimate_smoke_color(
+    images: list[np.ndarray],  # [h, w, 3] linear
+    backgrounds: list[np.ndarray],  # [h, w, 3] linear
+    candidates: list[np.ndarray],  # [h, w] bool: where smoke is believed
+    noise: float,  # sRGB code
+) -> SmokeColor | None:
+    """Colour of opaque smoke from the pixels that differ most from the background; None where there are too few.
+
+    The densest smoke is taken for opaque. Thin smoke that is nowhere opaque is therefore taken for thicker and darker
+    than it is; its picture over the clean plate stays the same.
+    """
+    colors, strengths = [], []
+    for image, background, candidate in zip(images, backgrounds, candidates, strict=True):
+        scaled = (image - background) / coded_noise_to_linear(np.maximum(image, background), noise)
+        strength = np.sqrt((scaled**2).sum(axis=2))
+        is_strong = candidate & (strength > 8.0)
+        colors.append(image[is_strong])
+        strengths.append(strength[is_strong])
+    color, strength = np.concatenate(colors), np.concatenate(strengths)
+    if len(color) < _MIN_COLOR_PIXELS:
+        return None
+    dense = color[strength >= np.percentile(strength, 85)]
+    direction = np.median(dense, axis=0)
+    luminance = dense @ LUMINANCE
+    brightness = float(np.median(luminance))
+    spread = float(np.percentile(luminance, 84) - np.percentile(luminance, 16)) / 2.0
+    if brightness < 1e-4:
+        return SmokeColor(direction=np.ones(3, np.float32), brightness=1e-4, spread=1e-2)
+    return SmokeColor(
+        direction=(direction / float(direction @ LUMINANCE)).astype(np.float32),
+        brightness=brightness,
+        spread=max(spread, 0.05 * brightness),
+    )

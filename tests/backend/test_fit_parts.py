@@ -1,0 +1,200 @@
+"""The parts of the fit, each on a case whose answer is known."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from backend.contract.cameras import Cameras
+from backend.contract.job import VisualConfig
+from backend.fit import depth_prior, explain, image_motion
+from backend.fit.appearance import Appearance
+from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
+from backend.fit.refine import as_gaussians, refine
+from backend.fit.scene import make_scene, optical_depth
+from backend.geometry.camera import View, view_at
+from backend.render import splat as renderer
+from backend.render.composite import composite
+
+STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -10.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def cameras(width: int = 96, height: int = 96, matrices: tuple = (STILL,)) -> Cameras:
+    return Cameras(
+        width=width, height=height, fx=100.0, fy=100.0, cx=width / 2, cy=height / 2, fps=20.0, camera_to_world=matrices
+    )
+
+
+def disc(radius: float, center: tuple[float, float] = (48.0, 48.0), size: tuple[int, int] = (96, 96)) -> np.ndarray:
+    """Optical depth one inside a disc [H, W]."""
+    y, x = np.mgrid[0 : size[0], 0 : size[1]] + 0.5
+    return (np.hypot(x - center[0], y - center[1]) < radius).astype(np.float32)
+
+
+def layer_of(tau: np.ndarray, color: float = 0.6) -> np.ndarray:
+    opacity = -np.expm1(-tau)
+    return np.dstack([color * opacity] * 3 + [opacity]).astype(np.float32)
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> tuple:
+    """camera_to_world of an upright camera that looks at a point."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = right, np.cross(forward, right), forward, position
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def test_a_disc_becomes_a_ball() -> None:
+    view = view_at(cameras(), 0)
+    prior = depth_prior.inflate(disc(20.0), view, np.zeros(3))
+    metres = 10.0 / 100.0  # a pixel at the anchor's depth
+    assert prior.half_thickness[48, 48] == pytest.approx(20 * metres, rel=0.06)
+    assert prior.half_thickness[48, 48 + 12] == pytest.approx(16 * metres, rel=0.10)  # 12-16-20
+    np.testing.assert_allclose(prior.center_depth, 10.0)
+
+
+def test_a_full_image_and_an_empty_one_have_a_finite_depth() -> None:
+    view = view_at(cameras(), 0)
+    for tau in (np.zeros((96, 96), np.float32), np.full((96, 96), 5.0, np.float32)):
+        prior = depth_prior.inflate(tau, view, np.zeros(3))
+        assert np.isfinite(prior.half_thickness).all()
+        assert (prior.half_thickness > 0).all()
+        assert prior.half_thickness.max() < 10.0
+
+
+def test_the_plane_of_a_camera_that_looks_down_is_upright() -> None:
+    matrix = look_at(np.array([0.0, -10.0, 3.0]), np.zeros(3))
+    view = view_at(cameras(matrices=(matrix,)), 0)
+    depth = depth_prior.plane_depth(view, np.zeros(3))
+    pixels = np.array([[48.0, 20.5], [48.0, 75.5]])
+    points = view.unproject(pixels, depth[[20, 75], [47, 47]])
+    np.testing.assert_allclose(points[:, 1], 0.0, atol=1e-9)
+
+
+def test_samples_follow_the_weight_and_the_profile() -> None:
+    view = view_at(cameras(), 0)
+    tau = disc(20.0)
+    prior = depth_prior.inflate(tau, view, np.zeros(3))
+    points, pixels = depth_prior.sample_points(tau, 4000, prior, view, seed=3)
+    assert len(points) == 4000
+    assert (tau[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0).all()
+    again, _ = depth_prior.sample_points(tau, 4000, prior, view, seed=3)
+    np.testing.assert_array_equal(points, again)
+    rows, columns = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
+    share = (view.to_camera(points)[:, 2] - 10.0) / prior.half_thickness[rows, columns]
+    assert abs(share.mean()) < 0.01
+    assert share.std() == pytest.approx(math.sqrt(1 / 6), rel=0.02)  # variance of (1 - s^2)^1.5 on -1..1 is 1/6
+    assert np.abs(share).max() <= 1.0
+    nothing, _ = depth_prior.sample_points(np.zeros((96, 96)), 100, prior, view, seed=0)
+    assert nothing.shape == (0, 3)
+
+
+def test_masses_explain_what_particles_could_have_drawn() -> None:
+    random = np.random.default_rng(5)
+    scene = make_scene([layer_of(disc(25.0))], cameras())
+    appearance = Appearance(scene, [layer_of(disc(25.0))], VisualConfig(num_particles=400, iterations=0), 0)
+    record, _ = appearance.look(appearance.empty(), 0)
+    true = record.optical_masses * random.uniform(0.5, 1.5, len(record.optical_masses)).astype(np.float32)
+    splat = renderer.forward(as_gaussians(record), scene.views[0])
+    target = renderer.reweighted(splat, true).image[0]
+    before = np.abs(splat.image[0] - target).sum()
+    fitted, masses = explain.fit_masses(splat, record.optical_masses, target, iterations=60, consistency=0.0)
+    assert np.abs(fitted.image[0] - target).sum() < 0.1 * before
+    assert masses.sum() == pytest.approx(true.sum(), rel=0.01)
+    _, kept = explain.fit_masses(splat, record.optical_masses, target, iterations=5, consistency=1.0)
+    np.testing.assert_allclose(kept, record.optical_masses, rtol=1e-5)
+
+
+def test_flow_gives_the_displacement_in_metres() -> None:
+    random = np.random.default_rng(1)
+    texture = cv2.GaussianBlur(random.random((96, 96)).astype(np.float32), (0, 0), 2.5)
+    texture = (texture - texture.min()) / np.ptp(texture) * disc(30.0)
+    shift = np.float32([[1, 0, 2.0], [0, 1, -1.0]])
+    moved = cv2.warpAffine(texture, shift, (96, 96), flags=cv2.INTER_CUBIC)
+    flow = image_motion.dense_flow(layer_of(1.5 * texture), layer_of(1.5 * np.maximum(moved, 0)))
+    view = view_at(cameras(), 0)
+    points = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.5]])
+    wanted, confidence = image_motion.lift_flow(flow, -np.expm1(-1.5 * texture), points, (view, view))
+    np.testing.assert_allclose(wanted, [[0.2, 0.0, 0.1]] * 2, atol=0.04)
+    assert (confidence > 0).all()
+    behind, none = image_motion.lift_flow(flow, texture, np.array([[0.0, -50.0, 0.0]]), (view, view))
+    np.testing.assert_array_equal(behind, 0.0)
+    np.testing.assert_array_equal(none, 0.0)
+
+
+def test_a_camera_that_moves_past_still_smoke_sees_no_motion() -> None:
+    first = view_at(cameras(matrices=(look_at(np.array([0.0, -10.0, 0.0]), np.zeros(3)),)), 0)
+    second = view_at(cameras(matrices=(look_at(np.array([0.6, -10.0, 0.0]), np.array([0.3, 0.0, 0.0])),)), 0)
+    points = np.array([[0.2, 0.3, -0.4], [-0.5, -0.2, 0.6]])
+    pixels, _ = first.project(points)
+    flow = np.zeros((96, 96, 2), np.float32)
+    rows, columns = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
+    flow[rows, columns] = second.project(points)[0] - pixels
+    wanted, _ = image_motion.lift_flow(flow, np.ones((96, 96)), points, (first, second))
+    np.testing.assert_allclose(wanted, 0.0, atol=1e-6)
+
+
+def test_refinement_lowers_the_error_and_stands_nothing_at_all() -> None:
+    layer = layer_of(2.0 * cv2.GaussianBlur(disc(20.0), (0, 0), 3.0))
+    layer[40:50, 40:50, :3] *= 0.5
+    scene = make_scene([layer], cameras())
+    appearance = Appearance(scene, [layer], VisualConfig(num_particles=800, iterations=0), 0)
+    record, _ = appearance.look(appearance.empty(), 0)
+
+    def error(of) -> float:
+        shown, opacity = composite(renderer.forward(as_gaussians(of), scene.views[0], features=of.colors).image)
+        return float(np.mean((shown - np.moveaxis(layer[..., :3], -1, 0)) ** 2) + np.mean((opacity - layer[..., 3]) ** 2))
+
+    refined, _ = refine(record, layer, scene.views[0], iterations=25, reference_scale=appearance.scale)
+    assert error(refined) < 0.5 * error(record)
+    nobody, loss = refine(appearance.empty(), layer, scene.views[0], iterations=3, reference_scale=1.0)
+    assert len(nobody.positions) == 0
+    assert math.isfinite(loss)
+
+
+def test_rays_through_the_foot_of_the_smoke_meet_at_its_source() -> None:
+    source = np.array([0.4, -0.3, 0.0])
+    angles = np.radians(np.linspace(-105, -45, 9))
+    matrices = tuple(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 1.0])) for a in angles)
+    given = cameras(matrices=matrices)
+    layers = []
+    for index in range(len(matrices)):
+        tau = np.zeros((96, 96), np.float32)
+        for height, drift in zip(np.linspace(0, 1.5, 12), np.linspace(0, 0.6, 12), strict=True):
+            pixel = view_at(given, index).project(source[None] + [[drift, 0, height]])[0][0]
+            tau += 0.3 * disc(4.0 + 3 * height, tuple(pixel))
+        layers.append(layer_of(tau))
+    np.testing.assert_allclose(make_scene(layers, given).anchor, source, atol=0.25)
+    np.testing.assert_allclose(make_scene(layers[:1], cameras()).anchor, 0.0, atol=1e-9)
+
+
+def test_records_take_and_join() -> None:
+    layer = layer_of(disc(20.0))
+    scene = make_scene([layer], cameras())
+    appearance = Appearance(scene, [layer], VisualConfig(num_particles=100, iterations=0), 0)
+    record, _ = appearance.look(appearance.empty(), 0)
+    half = take(record, np.arange(len(record.positions)) % 2 == 0)
+    newborn = {name: getattr(half, name)[:3] for name in ("positions", "velocities", "scales", "optical_masses", "colors", "born")}
+    more = join(half, **newborn)
+    assert len(more.positions) == len(half.positions) + 3
+    assert len(set(more.ids.tolist())) == len(more.ids)
+    assert int(more.next_id) == int(record.next_id) + 3
+
+
+def test_a_frames_mass_is_its_optical_depth_times_the_area() -> None:
+    layer = layer_of(disc(20.0))
+    scene = make_scene([layer], cameras())
+    expected = float(optical_depth(layer).sum()) * (10.0 / 100.0) ** 2
+    assert frame_mass(scene, layer, 0) == pytest.approx(expected, rel=1e-6)
+    assert pixel_mass(scene.views[0], np.array(10.0)) == pytest.approx(0.01)
+
+
+def test_who_is_near_the_image() -> None:
+    view: View = view_at(cameras(), 0)
+    points = np.array([[0.0, 0, 0], [5.5, 0, 0], [7.0, 0, 0], [0.0, -20.0, 0.0]])
+    np.testing.assert_array_equal(is_near_image(points, view), [True, True, False, False])
