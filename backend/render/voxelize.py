@@ -19,14 +19,14 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-
 from backend.io.particles import ParticleFrame
 
 CUTOFF = 3.0  # standard deviations; what lies beyond (0.8 % of a Gaussian) is shared out within
 MIN_SCALE_VOXELS = 0.6
 
 _SLAB = 4  # voxels along x filled by one thread at a time
-_DENSE_ENOUGH = 2.0  # voxels; sums over the lattice equal integrals to 1e-30 from here on
+_WIDE_AXIS = 64.0  # voxels; a sum over the lattice equals the integral to 1e-4 from here on: one voxel at the cutoff
+_WIDE = 8.0  # voxels, the same for an ellipsoid, whose surface averages over many voxels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +133,9 @@ def _splat(
             amplitudes = weights / _lattice_sums(centers, widths, precision, np.abs(np.linalg.det(factors)))
             _fill_anisotropic(centers, precision, amplitudes.astype(np.float32), payload, boxes, targets)
         else:
-            _fill_isotropic(centers, np.ascontiguousarray(factors[:, 0, 0]), weights, payload, boxes, targets)
+            sigmas = np.ascontiguousarray(factors[:, 0, 0])
+            amplitudes = weights / _axis_sums(centers, sigmas)
+            _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets)
 
 
 @numba.njit(cache=True)
@@ -157,18 +159,26 @@ def _members_of_slabs(low, high, num_x):  # -> starts [S + 1], members
     return starts, members
 
 
-@numba.njit(cache=True, inline="always")
-def _axis_total(center, sigma):  # -> sum of exp(-(v - center)^2 / 2 sigma^2) over the whole numbers v within the cutoff
-    if sigma >= _DENSE_ENOUGH:
-        return sigma * math.sqrt(2.0 * math.pi) * math.erf(CUTOFF / math.sqrt(2.0))
-    total = 0.0
-    for v in range(math.ceil(center - CUTOFF * sigma), math.floor(center + CUTOFF * sigma) + 1):
-        total += math.exp(-0.5 * ((v - center) / sigma) ** 2)
-    return total
+@numba.njit(cache=True, parallel=True)
+def _axis_sums(centers, sigmas):  # -> [N] product over the axes of sum_v exp(-(v - center)^2 / 2 sigma^2) within the cutoff
+    sums = np.ones(centers.shape[0], np.float64)
+    for p in numba.prange(centers.shape[0]):
+        sigma = sigmas[p]
+        inverse = -0.5 / (sigma * sigma)
+        for axis in range(3):
+            if sigma >= _WIDE_AXIS:
+                sums[p] *= sigma * math.sqrt(2.0 * math.pi) * math.erf(CUTOFF / math.sqrt(2.0))
+                continue
+            center = centers[p, axis]
+            total = 0.0
+            for v in range(math.ceil(center - CUTOFF * sigma), math.floor(center + CUTOFF * sigma) + 1):
+                total += math.exp(inverse * (v - center) ** 2)
+            sums[p] *= total
+    return sums
 
 
 @numba.njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _fill_isotropic(centers, sigmas, weights, payload, boxes, targets):
+def _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets):
     """Separable: three short tables of exponentials, then a product per voxel."""
     num_x, num_y, num_z = targets.density.shape
     for slab in numba.prange(boxes.starts.shape[0] - 1):
@@ -181,13 +191,12 @@ def _fill_isotropic(centers, sigmas, weights, payload, boxes, targets):
             p = boxes.members[member]
             cx, cy, cz = centers[p, 0], centers[p, 1], centers[p, 2]
             sigma = sigmas[p]
-            scale = weights[p] / (_axis_total(cx, sigma) * _axis_total(cy, sigma) * _axis_total(cz, sigma))
             inverse = -0.5 / (sigma * sigma)
             z0, z1 = boxes.low[p, 2], boxes.high[p, 2]
             for k in range(z0, z1):
                 table[k - z0] = math.exp(inverse * (k - cz) ** 2)
             for i in range(max(boxes.low[p, 0], first), min(boxes.high[p, 0], last)):
-                along_x = scale * math.exp(inverse * (i - cx) ** 2)
+                along_x = amplitudes[p] * math.exp(inverse * (i - cx) ** 2)
                 for j in range(boxes.low[p, 1], boxes.high[p, 1]):
                     along_xy = np.float32(along_x * math.exp(inverse * (j - cy) ** 2))
                     for k in range(z1 - z0):
@@ -232,7 +241,7 @@ def _lattice_sums(centers, widths, precision, volumes):  # -> [N] sum of a parti
     inside = math.erf(CUTOFF / math.sqrt(2.0)) - math.sqrt(2.0 / math.pi) * CUTOFF * math.exp(-0.5 * CUTOFF * CUTOFF)
     for p in numba.prange(centers.shape[0]):
         # Wide ones: the integral over the ellipsoid, without walking through all of it.
-        if widths[p].min() > 8.0 * CUTOFF:
+        if widths[p].min() > _WIDE * CUTOFF:
             sums[p] = volumes[p] * (2.0 * math.pi) ** 1.5 * inside
             continue
         z0 = math.ceil(centers[p, 2] - widths[p, 2])
