@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from backend.contract.job import ExtractionConfig
@@ -20,7 +19,6 @@ _MEMORY = 256 * 2**20  # bytes of frames that the temporal plate may hold
 _SKY_SPACING = 4  # frames between two fits of the sky of a moving camera
 _MAX_SKY_FITS = 120
 _MIN_SKY_FITS = 0.7  # share of the sampled frames in which a sky must be found
-_STATIC = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +46,7 @@ class Background:
             return self.plate.color, np.ones(self.plate.color.shape[:2], bool)
         from_first = np.linalg.inv(self.motion.between(index))
         moved = warp(self.plate.color, from_first)
-        is_known = np.isfinite(moved).all(axis=2)
+        is_known = np.asarray(np.isfinite(moved).all(axis=2))
         return fill_smoothly(np.nan_to_num(moved), is_known), is_known
 
     def placed(self, mask: np.ndarray, index: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +49,7 @@ def temporal_plate(samples: Sequence[np.ndarray]) -> CleanPlate:
 
 def frame_noise(coded: Sequence[np.ndarray]) -> float:
     """Noise of one frame [h, w, 3], sRGB code: from differences of frames in time, of which most pixels show no smoke."""
-    spreads = [np.nanmedian(np.abs(b - a)) / (0.6745 * np.sqrt(2.0)) for a, b in zip(coded, coded[1:], strict=False)]
+    spreads = [np.nanmedian(np.abs(b - a)) / (0.6745 * np.sqrt(2.0)) for a, b in itertools.pairwise(coded)]
     return max(float(np.median(spreads)), _MIN_NOISE)
 
 

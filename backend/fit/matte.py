@@ -12,6 +12,7 @@ from backend.contract.job import ExtractionConfig
 from backend.fit import matting
 from backend.fit.artist_masks import ArtistMasks
 from backend.fit.background import Background, find_background
+from backend.fit.connected import components
 from backend.fit.matting import SmokeColor
 from backend.io.images import LUMINANCE, linear_to_srgb
 
@@ -137,7 +138,7 @@ def _region(images: list[np.ndarray], numbers: list[int], matte: Matte) -> np.nd
     box = (2 * reach + 1, 2 * reach + 1)
     share = cv2.blur(explained, box) / np.maximum(cv2.blur(weight, box), 1e-9)
     is_smoke = (most > 2.0 * _MIN_LOW) & (share > _MIN_EXPLAINED)
-    num, labels = cv2.connectedComponents(is_smoke.astype(np.uint8), connectivity=8)
+    num, labels = components(is_smoke)
     dwells = np.zeros(num, bool)
     dwells[np.unique(labels[total / len(images) > _MIN_DWELL])] = True
     dwells[0] = False

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from backend.fit.connected import components
 from backend.io.images import LUMINANCE
 
 _OPACITY_SPREAD = 1.0  # prior deviation of opacity around 0: holds it down where J and S look alike
@@ -110,10 +111,10 @@ def hysteresis(
     min_pixels: int = 9,
 ) -> np.ndarray:
     """[h, w] 0..1: what to keep of an opacity. Regions that stay below `high`, or are specks, go."""
-    num, labels, stats, _ = cv2.connectedComponentsWithStats((opacity > low).astype(np.uint8), connectivity=8)
+    num, labels = components(opacity > low)
     reaches = np.zeros(num, np.int64)
     np.add.at(reaches, labels[opacity > high], 1)
-    is_kept = (reaches >= max(1, min_pixels // 3)) & (stats[:, cv2.CC_STAT_AREA] >= min_pixels)
+    is_kept = (reaches >= max(1, min_pixels // 3)) & (np.bincount(labels.ravel(), minlength=num) >= min_pixels)
     is_kept[0] = False
     ramp = np.clip(opacity / np.maximum(low, 1e-6) - 1.0, 0.0, 1.0)
     return np.where(is_kept[labels], ramp, 0.0).astype(np.float32)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from backend.fit.connected import components
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 MAX_BLACK_LEVEL = 20 / 255  # sRGB code; video black of limited range is 16
@@ -89,7 +90,7 @@ def _floor_luminance(level: float, floor: float) -> float:
 def _above_floor(luminance: np.ndarray, floor: float) -> np.ndarray:
     """[h, w] 0..1: 0 below the noise floor and on specks that nowhere rise well above it, 1 from twice the floor on."""
     smooth = cv2.GaussianBlur(luminance, (0, 0), 1.0)
-    num, labels = cv2.connectedComponents((smooth > floor).astype(np.uint8), connectivity=8)
+    num, labels = components(smooth > floor)
     has_seed = np.zeros(num, bool)
     has_seed[np.unique(labels[smooth > _SEED * floor])] = True
     has_seed[0] = False

@@ -111,7 +111,7 @@ def _skyline(coded: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
     Above it pixels should be clear sky or a mixture of sky and grey; below it they should look like the ground, whose
     colours and texture are learned from the rows below the lowest clear sky; on it there should be an edge.
     """
-    height, width = coded.shape[:2]
+    width = coded.shape[1]
     ground = _ground_likeness(coded, is_clear)
     above = np.where(is_clear, 0.0, ground)
     below = np.where(is_clear, 2.0, 1.0 - ground)
@@ -129,7 +129,7 @@ def _ground_likeness(coded: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
     Two histograms of colour and local texture: of the rows surely on the ground, and of the sky with what is in it.
     """
     height, _ = is_clear.shape
-    clear_rows = np.flatnonzero(is_clear.mean(axis=1) > 0.05)
+    clear_rows = np.flatnonzero(np.asarray(is_clear.mean(axis=1)) > 0.05)
     lowest = int(clear_rows.max()) + 1
     ground_from = min(height - 2, lowest + max(2, height // 50))
     luma = coded.mean(axis=2)
@@ -162,7 +162,7 @@ def _cheapest_path(cost: np.ndarray) -> np.ndarray:
     for column in range(1, width):
         padded = np.pad(total, _MAX_STEP, constant_values=np.inf)
         options = np.stack([padded[_MAX_STEP + s : _MAX_STEP + s + rows] + _STEP_COST * abs(s) for s in steps])
-        best = options.argmin(axis=0)
+        best = np.asarray(options.argmin(axis=0))
         came[:, column] = steps[best]
         total = options[best, np.arange(rows)] + cost[:, column]
     path = np.empty(width, np.int64)

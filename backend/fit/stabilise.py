@@ -15,6 +15,7 @@ MIN_TRACKS = 12  # fewer tell nothing about the camera
 STILL_SHARE = 0.0025  # of the longest side: a camera on a tripod in wind
 _LOST_SHARE = 0.4  # of the tracks gone: take new ones
 _INLIER_PX = 1.5
+_SMOKE_OPACITY = 0.02  # from here on a pixel is smoke and tells nothing about the camera
 _PARALLAX_SHARE = 0.0015  # of the longest side: beyond it no single homography holds the background
 
 
@@ -105,6 +106,12 @@ def measure_motion(
         displacement=max(shifts, default=0.0) / longest,
         parallax=float(np.percentile(errors, 90)) / longest if errors else 0.0,
     )
+
+
+def is_background(layer: np.ndarray) -> np.ndarray:
+    """[h, w] bool: at some distance from all smoke of a layer [h, w, 4]."""
+    size = 2 * max(2, round(0.015 * max(layer.shape[:2]))) + 1
+    return cv2.dilate((layer[..., 3] > _SMOKE_OPACITY).astype(np.uint8), np.ones((size, size), np.uint8)) == 0
 
 
 def warp(image: np.ndarray, homography: np.ndarray) -> np.ndarray:

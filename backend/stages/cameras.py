@@ -1,0 +1,136 @@
+"""Smoke layer -> the camera of every frame: given, or one that stands still.
+
+The still camera looks along +y at the world's origin from `distance_m`, z up; `elevation_deg` lifts it and tilts it
+down around the origin. Its focal length follows from `field_of_view_deg` over the longer side of the picture:
+f = (longer side / 2) / tan(field of view / 2), the same for x and y, with the principal point in the middle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from backend.contract.cameras import Cameras, Matrix
+from backend.contract.errors import BackendError
+from backend.contract.job import CamerasConfig
+from backend.fit import stabilise
+from backend.fit.stabilise import ImageMotion
+from backend.reporting import Report
+
+_MAX_SAMPLES = 120
+_ASPECT_TOLERANCE = 0.01
+_FPS_TOLERANCE = 0.01
+
+
+def run(
+    *,
+    num_frames: int,
+    frame_start: int = 0,
+    size: tuple[int, int],  # (width, height) px of the frames that are fitted
+    fps: float,
+    config: CamerasConfig,
+    given: Cameras | None,
+    motion: Callable[[], ImageMotion],
+    report: Report,
+) -> Cameras:
+    """Cameras of the fitted frames, intrinsics in px of `size`; frame 0 is the clip's frame `frame_start`.
+
+    Given cameras may go on beyond the fitted frames (a forecast reaches there). Raises BackendError.
+    """
+    if config.mode == "given" and given is None:
+        raise BackendError(
+            "cameras_missing", "No cameras.json was given.", hint='Give one with --cameras, or set cameras.mode to "auto".'
+        )
+    if given is not None and config.mode != "still":
+        return _fitting(given, num_frames, frame_start, size, fps, report)
+    if given is not None:
+        report.warning("cameras_ignored", 'A cameras.json was given, but cameras.mode is "still"; it is not used.')
+    elif config.mode == "auto":
+        moved = motion()
+        if not moved.is_still:
+            report.warning(
+                "camera_moves",
+                f"The camera moves (the background shifts by {moved.displacement:.0%} of the picture); for now it is "
+                "treated as if it stood still. Give the solved camera with --cameras cameras.json.",
+            )
+    return still_camera(size, fps, config)
+
+
+def still_camera(size: tuple[int, int], fps: float, config: CamerasConfig) -> Cameras:
+    """The camera of the settings; size: (width, height) px."""
+    width, height = size
+    focal = 0.5 * max(size) / math.tan(math.radians(config.field_of_view_deg) / 2.0)
+    e = math.radians(config.elevation_deg)
+    position = (0.0, -config.distance_m * math.cos(e), config.distance_m * math.sin(e))
+    right, down, forward = (1.0, 0.0, 0.0), (0.0, -math.sin(e), -math.cos(e)), (0.0, math.cos(e), -math.sin(e))
+    rows = [(right[k], down[k], forward[k], position[k]) for k in range(3)]
+    return Cameras(
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        cx=width / 2.0,
+        cy=height / 2.0,
+        fps=fps,
+        camera_to_world=((*rows, (0.0, 0.0, 0.0, 1.0)),),
+    )
+
+
+def measure_motion(
+    frames: Sequence[np.ndarray],  # each [h, w, >= 3] linear
+    report: Report,
+    *,
+    smoke: Sequence[np.ndarray] | None = None,  # each [h, w, 4], its opacity excludes smoke
+) -> ImageMotion:
+    """How the picture moves as a whole, from features of the background (backend.fit.stabilise)."""
+    num = min(len(frames), _MAX_SAMPLES)
+    indices = np.unique(np.linspace(0, len(frames) - 1, num).astype(int)).tolist()
+    return stabilise.measure_motion(
+        frames,
+        indices,
+        background=None if smoke is None else lambda index: stabilise.is_background(smoke[index]),
+        on_step=report.progress,
+    )
+
+
+def _fitting(given: Cameras, num_frames: int, frame_start: int, size: tuple[int, int], fps: float, report: Report) -> Cameras:
+    """The given cameras from the first fitted frame on, at the size of the frames."""
+    sx, sy = size[0] / given.width, size[1] / given.height
+    tolerance = _ASPECT_TOLERANCE + 1.0 / min(size)  # the frames' size is rounded to whole pixels
+    if abs(math.log(sx / sy)) > tolerance:
+        raise BackendError(
+            "cameras_aspect",
+            f"cameras.json is for pictures of {given.width} x {given.height}, the clip's are shaped like {size[0]} x {size[1]}.",
+            hint="Solve the camera on the same picture, without letterbox or crop.",
+        )
+    if abs(given.fps / fps - 1.0) > _FPS_TOLERANCE:
+        report.warning(
+            "cameras_fps",
+            f"cameras.json says {given.fps:g} frames a second, the clip {fps:g}; the clip's rate is used.",
+        )
+    return Cameras(
+        width=size[0],
+        height=size[1],
+        fx=given.fx * sx,
+        fy=given.fy * sy,
+        cx=given.cx * sx,
+        cy=given.cy * sy,
+        fps=fps,
+        camera_to_world=_of_frames(given, num_frames, frame_start),
+    )
+
+
+def _of_frames(given: Cameras, num_frames: int, frame_start: int) -> tuple[Matrix, ...]:
+    """One matrix for each fitted frame, and those behind them. A file of exactly the fitted frames is taken as it is."""
+    matrices = given.camera_to_world
+    if given.is_still or len(matrices) == num_frames:
+        return matrices
+    if len(matrices) < frame_start + num_frames:
+        raise BackendError(
+            "cameras_too_few",
+            f"cameras.json has {len(matrices)} cameras, but frames {frame_start} to {frame_start + num_frames - 1} are fitted.",
+            hint="Give one camera for each frame of the clip, or a single one for a camera that stands still.",
+        )
+    return matrices[frame_start:]
