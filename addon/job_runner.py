@@ -16,8 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
@@ -55,10 +55,14 @@ class RunState(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backend:
-    """Which Python runs which backend. root: the folder that holds `backend/`, so that both versions always match."""
+    """Which Python runs which backend. root: the folder that holds `backend/`, so that both versions always match.
+
+    variables: of the environment, that it gets besides.
+    """
 
     python: str
     root: Path
+    variables: Mapping[str, str] = field(default_factory=dict)
 
     def command(self, job_folder: Path) -> list[str]:
         return [self.python, "-m", "backend", "run", "--job", str(job_folder)]
@@ -70,7 +74,7 @@ class Backend:
             "PYTHONPATH": str(self.root),
             "PYTHONUTF8": "1",
             "PYTHONUNBUFFERED": "1",
-            "WILDSMOKE_BLENDER_PYTHON": sys.executable,  # has openvdb, should the backend's environment have none
+            **self.variables,
         }
 
 
