@@ -47,12 +47,12 @@ def draw_report(job: Path, path: Path) -> None:
                 picture(particle_frame, orbit(view, pivot, 90.0))[..., :3],
             ]
             rows.append(np.hstack([_tile(tile) for tile in tiles]))
-    sheet = np.vstack(rows)
+    sheet = images.encode_srgb(np.vstack(rows))
     for column, title in enumerate(COLUMNS):
         place = (column * sheet.shape[1] // len(COLUMNS) + 8, 20)
-        cv2.putText(sheet, title, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0.8, 0.8, 0.8), 1, cv2.LINE_AA)
+        cv2.putText(sheet, title, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220, 220, 220), 1, cv2.LINE_AA)
     with whole_file(path) as part:
-        images.write_png(part, sheet)
+        images.write_png(part, images.decode_srgb(sheet))
 
 
 def orbit(view: View, pivot: np.ndarray, degrees: float) -> View:
