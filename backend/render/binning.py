@@ -6,7 +6,7 @@ on one band. Bands list their splats in order of index; slots number the pairs b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -16,20 +16,20 @@ from .pyramid import Pyramid
 BAND_ROWS = 16
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bins:
+class Bins(NamedTuple):  # a tuple, because numba takes those
     """Splats by band, P pairs in all."""
 
     band_levels: np.ndarray  # [B] int64
     band_rows: np.ndarray  # [B] int64, first row
     band_starts: np.ndarray  # [B + 1] int64 into pair_splats and pair_slots
-    pair_splats: np.ndarray  # [P] int32
+    pair_splats: np.ndarray  # [P] int64
     pair_slots: np.ndarray  # [P] int64
     slot_starts: np.ndarray  # [N + 1] int64
+    order: np.ndarray  # [B] int64, bands with most pairs first: dealt in turn, they load the threads evenly
 
 
 @njit(cache=True, parallel=True)
-def _count(levels, rows, first_bands, num_chunks, counts, num_slots):
+def _count(levels, boxes, first_bands, num_chunks, counts, num_slots):
     """counts [chunks, B]: pairs of each band in each chunk of splats; num_slots [N]: bands of each splat."""
     num = levels.shape[0]
     for chunk in prange(num_chunks):
@@ -37,43 +37,43 @@ def _count(levels, rows, first_bands, num_chunks, counts, num_slots):
             num_slots[i] = 0
             if levels[i] >= 0:
                 base = first_bands[levels[i]]
-                low, high = rows[i, 0] // BAND_ROWS, rows[i, 1] // BAND_ROWS
+                low, high = boxes[i, 0] // BAND_ROWS, boxes[i, 1] // BAND_ROWS
                 num_slots[i] = high - low + 1
                 for band in range(low, high + 1):
                     counts[chunk, base + band] += 1
 
 
 @njit(cache=True, parallel=True)
-def _fill(levels, rows, first_bands, num_chunks, cursors, slot_starts, pair_splats, pair_slots):
+def _fill(levels, boxes, first_bands, num_chunks, cursors, slot_starts, pair_splats, pair_slots):
     """cursors [chunks, B]: where each chunk begins in each band."""
     num = levels.shape[0]
     for chunk in prange(num_chunks):
         for i in range(chunk * num // num_chunks, (chunk + 1) * num // num_chunks):
             if levels[i] >= 0:
                 base = first_bands[levels[i]]
-                low = rows[i, 0] // BAND_ROWS
-                for band in range(low, rows[i, 1] // BAND_ROWS + 1):
+                low = boxes[i, 0] // BAND_ROWS
+                for band in range(low, boxes[i, 1] // BAND_ROWS + 1):
                     at = cursors[chunk, base + band]
                     pair_splats[at] = i
                     pair_slots[at] = slot_starts[i] + band - low
                     cursors[chunk, base + band] = at + 1
 
 
-def bin_splats(pyramid: Pyramid, levels: np.ndarray, rows: np.ndarray) -> Bins:
-    """levels [N] int64 (-1: none), rows [N, 2] int64: first and last row on the level."""
+def bin_splats(pyramid: Pyramid, levels: np.ndarray, boxes: np.ndarray) -> Bins:
+    """levels [N] int64 (-1: none), boxes [N, 4] int64: first and last row, first and last column on the level."""
     bands_of_level = -(-pyramid.rows // BAND_ROWS)
     first_bands = np.concatenate([[0], np.cumsum(bands_of_level)]).astype(np.int64)
     num_bands = int(first_bands[-1])
     num_chunks = max(1, min(64, len(levels) // 256))
     counts = np.zeros((num_chunks, num_bands), np.int64)
     num_slots = np.empty(len(levels), np.int64)
-    _count(levels, rows, first_bands, num_chunks, counts, num_slots)
+    _count(levels, boxes, first_bands, num_chunks, counts, num_slots)
     slot_starts = np.concatenate([[0], np.cumsum(num_slots)]).astype(np.int64)
     band_starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))]).astype(np.int64)
     cursors = band_starts[:-1] + np.cumsum(counts, axis=0) - counts
-    pair_splats = np.empty(band_starts[-1], np.int32)
+    pair_splats = np.empty(band_starts[-1], np.int64)
     pair_slots = np.empty(band_starts[-1], np.int64)
-    _fill(levels, rows, first_bands, num_chunks, cursors, slot_starts, pair_splats, pair_slots)
+    _fill(levels, boxes, first_bands, num_chunks, cursors, slot_starts, pair_splats, pair_slots)
     return Bins(
         band_levels=np.repeat(np.arange(len(bands_of_level)), bands_of_level),
         band_rows=np.concatenate([np.arange(n) * BAND_ROWS for n in bands_of_level]).astype(np.int64),
@@ -81,4 +81,5 @@ def bin_splats(pyramid: Pyramid, levels: np.ndarray, rows: np.ndarray) -> Bins:
         pair_splats=pair_splats,
         pair_slots=pair_slots,
         slot_starts=slot_starts,
+        order=np.argsort(-np.diff(band_starts), kind="stable"),
     )

@@ -50,7 +50,9 @@ def require_finite(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None
         raise ValueError(f"{name} holds NaN or infinity")
 
 
-def isotropic(positions: np.ndarray, scales: np.ndarray, optical_masses: np.ndarray, colors: np.ndarray | None = None) -> Gaussians:
+def isotropic(
+    positions: np.ndarray, scales: np.ndarray, optical_masses: np.ndarray, colors: np.ndarray | None = None
+) -> Gaussians:
     """Round Gaussians: positions [N, 3] m, scales [N] m, optical_masses [N] m^2, colors [N, 3] linear (white without)."""
     num = len(positions)
     return Gaussians(

@@ -99,9 +99,18 @@ def _level(top, side, across, determinant, num_levels):
     return level
 
 
+@njit(cache=True)
+def _reach(centre, variance, cell, count):
+    """First and last of `count` cells within the cut of a Gaussian with this variance [px^2]."""
+    reach = math.sqrt(2 * CUT * variance) / cell
+    return math.ceil(min(max(centre - reach, 0.0), float(count))), math.floor(max(min(centre + reach, count - 1.0), -1.0))
+
+
 @njit(cache=True, parallel=True)
-def project(positions, scales, rotations, rotation, camera, near, num_levels, num_chunks, splats, levels, rows):
-    """Fills splats [N, SPLAT_FIELDS], levels [N] (-1: not visible) and rows [N, 2], first and last row on the level.
+def project(positions, scales, rotations, rotation, camera, near, num_levels, num_chunks, splats, levels, boxes):
+    """Fills splats [N, SPLAT_FIELDS], levels [N] (-1: not visible) and boxes [N, 4], the cells that a splat may touch.
+
+    A box is first row, last row, first column, last column on the level, margins counted.
 
     rotation: world to camera [3, 3]; camera: fx, fy, cx, cy, width, height, position x, y, z [9].
     """
@@ -110,7 +119,7 @@ def project(positions, scales, rotations, rotation, camera, near, num_levels, nu
         local, m = np.empty(9), np.empty(6)
         for i in range(chunk * num // num_chunks, (chunk + 1) * num // num_chunks):
             levels[i] = -1
-            rows[i, 0], rows[i, 1] = 0, -1
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, -1, 0, -1
             for k in range(SPLAT_FIELDS):
                 splats[i, k] = 0.0
             x, y, z, tx, ty = _project_one(positions[i], rotations[i], scales[i], rotation, camera, near, local, m)
@@ -127,25 +136,15 @@ def project(positions, scales, rotations, rotation, camera, near, num_levels, nu
             u, v = fx * x / z + camera[2], fy * y / z + camera[3]
             cell = 2.0**level
             margin = MARGIN if level else 0
-            reach_x, reach_y = math.sqrt(2 * CUT * variance_x), math.sqrt(2 * CUT * variance_y)
-            edge = margin * cell
-            if (
-                u + reach_x < -edge
-                or u - reach_x > width + edge + cell
-                or v + reach_y < -edge
-                or v - reach_y > height + edge + cell
-            ):
-                continue
-            num_rows = math.ceil(height / cell) + 2 * margin
-            centre, reach_y = v / cell - 0.5 + margin, reach_y / cell
-            first = math.ceil(max(centre - reach_y, 0.0))
-            last = math.floor(min(centre + reach_y, num_rows - 1.0))
-            if first > last:
+            centre_x, centre_y = u / cell - 0.5 + margin, v / cell - 0.5 + margin
+            first, last = _reach(centre_y, variance_y, cell, math.ceil(height / cell) + 2 * margin)
+            left, right = _reach(centre_x, variance_x, cell, math.ceil(width / cell) + 2 * margin)
+            if first > last or left > right:
                 continue
             px2 = fx * fy * math.sqrt(1 + tx * tx + ty * ty) / (z * z) * _fade(z, near)[0]
             levels[i] = level
-            rows[i, 0], rows[i, 1] = first, last
-            splats[i, 0], splats[i, 1] = u / cell - 0.5 + margin, centre
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = first, last, left, right
+            splats[i, 0], splats[i, 1] = centre_x, centre_y
             splats[i, 2], splats[i, 3] = variance_y / det * cell * cell, cell * cell / variance_y
             splats[i, 4] = across / variance_y
             splats[i, 5] = 1.0 / (2 * math.pi * math.sqrt(det))

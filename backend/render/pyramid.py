@@ -11,7 +11,7 @@ and every row ROW_PADDING elements that belong to no cell. All levels of all cha
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -24,8 +24,7 @@ NUM_TAPS = 11
 SMALLEST = np.float32(1e-25)  # smaller values are set to 0 between the passes: products of tails would be denormal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pyramid:
+class Pyramid(NamedTuple):  # a tuple, because numba takes those
     """Where each level lies. `offsets` counts elements for one channel; with C channels a level starts at C * offset."""
 
     rows: np.ndarray  # [L] int64, margins included
@@ -66,10 +65,10 @@ def _first_tap(fine_margin):
 
 
 @njit(cache=True, parallel=True)
-def widen(coarse, start, num_rows, stride, num_pairs, fine_margin, taps, out, out_stride):
-    """Along rows: out [num_rows, 2, out_stride] gets the even and the odd fine columns, num_pairs of each."""
+def widen(coarse, start, num_lines, stride, num_pairs, fine_margin, taps, out, out_stride):
+    """Along rows: out [num_lines, 2, out_stride] gets the even and the odd fine columns, num_pairs of each."""
     first = _first_tap(fine_margin)
-    for r in prange(num_rows):
+    for r in prange(num_lines):
         source = start + r * stride + first
         for k in range(0, num_pairs, LANES):
             even = spread(np.float32(0))
@@ -83,11 +82,12 @@ def widen(coarse, start, num_rows, stride, num_pairs, fine_margin, taps, out, ou
 
 
 @njit(cache=True, parallel=True)
-def heighten(wide, wide_stride, num_pairs, fine_margin, taps, fine, start, num_rows, stride):
-    """Along columns: adds the up-sampled coarse level to the fine one."""
+def heighten(wide, wide_stride, coarse_rows, num_pairs, fine_margin, taps, fine, start, num_channels, num_rows, stride):
+    """Along columns: adds the up-sampled coarse level, wide [C, coarse_rows, 2, wide_stride], to the fine one."""
     first = _first_tap(fine_margin)
-    for r in prange(num_rows):
-        source = (r // 2 + first) * 2 * wide_stride
+    for line in prange(num_channels * num_rows):
+        r = line % num_rows
+        source = (line // num_rows * coarse_rows + r // 2 + first) * 2 * wide_stride
         for k in range(0, num_pairs, LANES):
             even = spread(np.float32(0))
             odd = spread(np.float32(0))
@@ -95,38 +95,41 @@ def heighten(wide, wide_stride, num_pairs, fine_margin, taps, fine, start, num_r
                 weight = spread(taps[r % 2, d])
                 even = muladd(load(wide, source + 2 * d * wide_stride + k), weight, even)
                 odd = muladd(load(wide, source + (2 * d + 1) * wide_stride + k), weight, odd)
-            target = start + r * stride + 2 * k
+            target = start + line * stride + 2 * k
             even = add(flushed(even, SMALLEST), load_stride2(fine, target))
             odd = add(flushed(odd, SMALLEST), load_stride2(fine, target + 1))
             store_interleaved(fine, target, even, odd)
 
 
 @njit(cache=True, parallel=True)
-def heighten_adjoint(fine, start, num_rows, stride, num_pairs, fine_margin, taps, out, out_stride, out_rows, lead):
-    """Transpose of heighten: out [out_rows, 2, out_stride] from the fine level; columns begin at `lead`."""
+def heighten_adjoint(
+    fine, start, num_channels, num_rows, stride, num_pairs, fine_margin, taps, wide, wide_stride, coarse_rows, lead
+):  # fmt: skip
+    """Transpose of heighten: writes wide [C, coarse_rows, 2, wide_stride]; columns begin at `lead`, zeros around them."""
     first = _first_tap(fine_margin)
-    for c in prange(out_rows):
+    for line in prange(num_channels * coarse_rows):
+        channel, c = line // coarse_rows, line % coarse_rows
+        wide[2 * line * wide_stride : 2 * (line + 1) * wide_stride] = np.float32(0)
         for k in range(0, num_pairs, LANES):
             even = spread(np.float32(0))
             odd = spread(np.float32(0))
             for d in range(NUM_TAPS):
-                pair = c - first - d
                 for parity in range(2):
-                    r = 2 * pair + parity
+                    r = 2 * (c - first - d) + parity
                     if 0 <= r < num_rows:
-                        source = start + r * stride + 2 * k
+                        source = start + (channel * num_rows + r) * stride + 2 * k
                         weight = spread(taps[parity, d])
                         even = muladd(load_stride2(fine, source), weight, even)
                         odd = muladd(load_stride2(fine, source + 1), weight, odd)
-            store(out, 2 * c * out_stride + lead + k, flushed(even, SMALLEST))
-            store(out, (2 * c + 1) * out_stride + lead + k, flushed(odd, SMALLEST))
+            store(wide, 2 * line * wide_stride + lead + k, flushed(even, SMALLEST))
+            store(wide, (2 * line + 1) * wide_stride + lead + k, flushed(odd, SMALLEST))
 
 
 @njit(cache=True, parallel=True)
-def widen_adjoint(wide, wide_stride, lead, num_pairs, fine_margin, taps, coarse, start, num_rows, num_columns, stride):
-    """Transpose of widen: writes the coarse level. `wide` holds zeros around its columns, which begin at `lead`."""
+def widen_adjoint(wide, wide_stride, lead, fine_margin, taps, coarse, start, num_lines, num_columns, stride):
+    """Transpose of widen: writes the coarse level."""
     first = _first_tap(fine_margin)
-    for r in prange(num_rows):
+    for r in prange(num_lines):
         for n in range(0, num_columns, LANES):
             cells = spread(np.float32(0))
             for d in range(NUM_TAPS):
@@ -140,39 +143,35 @@ def widen_adjoint(wide, wide_stride, lead, num_pairs, fine_margin, taps, coarse,
 
 def upsample(buffer: np.ndarray, pyramid: Pyramid, num_channels: int) -> None:
     """Adds every level to the next finer one, coarsest first, in place; level 0 ends as the image."""
-    for level in range(len(pyramid.rows) - 1, 0, -1):
-        fine_margin, num_pairs, stride = _columns(pyramid, level)
-        wide = np.empty(2 * pyramid.rows[level] * stride + ROW_PADDING, np.float32)
-        for channel in range(num_channels):
-            source = start_of(pyramid, level, channel, num_channels)
-            target = start_of(pyramid, level - 1, channel, num_channels)
-            rows, strides = pyramid.rows, pyramid.strides
-            widen(buffer, source, rows[level], strides[level], num_pairs, fine_margin, TAPS, wide, stride)
-            heighten(wide, stride, num_pairs, fine_margin, TAPS, buffer, target, rows[level - 1], strides[level - 1])
+    rows, strides = pyramid.rows, pyramid.strides
+    for level in range(len(rows) - 1, 0, -1):
+        fine_margin, num_pairs, wide_stride = _columns(pyramid, level)
+        wide = np.empty(num_channels * 2 * rows[level] * wide_stride + ROW_PADDING, np.float32)
+        coarse, fine = num_channels * pyramid.offsets[level], num_channels * pyramid.offsets[level - 1]
+        widen(buffer, coarse, num_channels * rows[level], strides[level], num_pairs, fine_margin, TAPS, wide, wide_stride)
+        heighten(
+            wide, wide_stride, rows[level], num_pairs, fine_margin, TAPS, buffer, fine, num_channels, rows[level - 1],
+            strides[level - 1],
+        )  # fmt: skip
 
 
 def upsample_adjoint(buffer: np.ndarray, pyramid: Pyramid, num_channels: int) -> None:
     """Transpose of upsample: from the gradient on level 0 (its padding zero) those on all the others, in place."""
+    rows, strides = pyramid.rows, pyramid.strides
     lead = 2 * LANES
-    for level in range(1, len(pyramid.rows)):
-        fine_margin, num_pairs, stride = _columns(pyramid, level)
-        stride += 4 * LANES
-        for channel in range(num_channels):
-            wide = np.zeros(2 * pyramid.rows[level] * stride + ROW_PADDING, np.float32)
-            source = start_of(pyramid, level - 1, channel, num_channels)
-            target = start_of(pyramid, level, channel, num_channels)
-            rows, columns, strides = pyramid.rows, pyramid.columns, pyramid.strides
-            heighten_adjoint(
-                buffer, source, rows[level - 1], strides[level - 1], num_pairs, fine_margin, TAPS, wide, stride, rows[level], lead
-            )
-            widen_adjoint(
-                wide, stride, lead, num_pairs, fine_margin, TAPS, buffer, target, rows[level], columns[level], strides[level]
-            )
-
-
-def start_of(pyramid: Pyramid, level: int, channel: int, num_channels: int) -> int:
-    """First element of one channel of one level in the flat array."""
-    return int(num_channels * pyramid.offsets[level] + channel * pyramid.rows[level] * pyramid.strides[level])
+    for level in range(1, len(rows)):
+        fine_margin, num_pairs, wide_stride = _columns(pyramid, level)
+        wide_stride += 2 * lead
+        wide = np.empty(num_channels * 2 * rows[level] * wide_stride + ROW_PADDING, np.float32)
+        coarse, fine = num_channels * pyramid.offsets[level], num_channels * pyramid.offsets[level - 1]
+        heighten_adjoint(
+            buffer, fine, num_channels, rows[level - 1], strides[level - 1], num_pairs, fine_margin, TAPS, wide, wide_stride,
+            rows[level], lead,
+        )  # fmt: skip
+        widen_adjoint(
+            wide, wide_stride, lead, fine_margin, TAPS, buffer, coarse, num_channels * rows[level], pyramid.columns[level],
+            strides[level],
+        )  # fmt: skip
 
 
 def _columns(pyramid: Pyramid, level: int) -> tuple[int, int, int]:

@@ -22,7 +22,7 @@ from .binning import Bins, bin_splats
 from .composite import composite, composite_backward
 from .gaussians import Gaussians, require_finite
 from .pyramid import Pyramid, make_pyramid, max_levels, upsample, upsample_adjoint
-from .splat_kernels import NUM_SUMS, differentiate, draw, gather, weigh
+from .splat_kernels import NUM_SUMS, copy_rows, differentiate, draw, gather, largest_magnitude, scaled_into, weigh
 
 __all__ = ["Gradients", "Splat", "adjoint_mass", "backward", "composite", "composite_backward", "forward", "reweighted"]
 
@@ -38,9 +38,9 @@ class Geometry:
     camera: np.ndarray  # [9] fx, fy, cx, cy, width, height, position
     splats: np.ndarray  # [N, SPLAT_FIELDS]
     levels: np.ndarray  # [N] -1: not visible
+    boxes: np.ndarray  # [N, 4] cells that a splat may touch: first and last row, first and last column
     pyramid: Pyramid
     bins: Bins
-    order: np.ndarray  # [B] bands, those with most pairs first
     num_chunks: int
 
 
@@ -86,16 +86,14 @@ def reweighted(splat: Splat, optical_masses: np.ndarray, features: np.ndarray | 
 
 def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
     """Gradients of a loss whose gradient with respect to splat.image is grad_image [1 + K, H, W]."""
-    require_finite("grad_image", grad_image, splat.image.shape)
+    _require_image("grad_image", grad_image, splat.image.shape)
     geometry, bins, num = splat.geometry, splat.geometry.bins, len(splat.gaussians)
     num_features = splat.features.shape[1]
-    gradient, scale = _gradient_levels(grad_image, geometry.pyramid)
+    gradient, scale = _gradient_levels("grad_image", grad_image, geometry.pyramid)
     slots = np.empty((len(bins.pair_slots), NUM_SUMS + num_features), np.float32)
-    p = geometry.pyramid
     differentiate(
-        gradient, 1 + num_features, p.rows, p.strides, p.columns, p.offsets, bins.band_levels, bins.band_rows, bins.band_starts,
-        bins.pair_splats, bins.pair_slots, geometry.splats, splat.features, geometry.order, numba.get_num_threads(), slots,
-    )  # fmt: skip
+        gradient, geometry.pyramid, bins, geometry.splats, geometry.boxes, splat.features, numba.get_num_threads(), slots
+    )
     sums = np.empty((num, NUM_SUMS + num_features))
     gather(slots, bins.slot_starts, geometry.num_chunks, sums)
     sums *= scale
@@ -122,14 +120,11 @@ def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
 
 def adjoint_mass(splat: Splat, image_grad: np.ndarray) -> np.ndarray:
     """Transpose of masses -> tau: [N] sums over pixels of image_grad [H, W] times d tau / d optical_mass [1/m^2]."""
-    require_finite("image_grad", image_grad, splat.image.shape[1:])
-    geometry, bins, p = splat.geometry, splat.geometry.bins, splat.geometry.pyramid
-    gradient, scale = _gradient_levels(image_grad[None], p)
+    _require_image("image_grad", image_grad, splat.image.shape[1:])
+    geometry, bins = splat.geometry, splat.geometry.bins
+    gradient, scale = _gradient_levels("image_grad", image_grad[None], geometry.pyramid)
     slots = np.empty((len(bins.pair_slots), 1), np.float32)
-    weigh(
-        gradient, p.rows, p.strides, p.columns, p.offsets, bins.band_levels, bins.band_rows, bins.band_starts, bins.pair_splats,
-        bins.pair_slots, geometry.splats, geometry.order, numba.get_num_threads(), slots[:, 0],
-    )  # fmt: skip
+    weigh(gradient, geometry.pyramid, bins, geometry.splats, geometry.boxes, numba.get_num_threads(), slots.reshape(-1))
     sums = np.empty((len(splat.gaussians), 1))
     gather(slots, bins.slot_starts, geometry.num_chunks, sums)
     return sums[:, 0] * geometry.splats[:, 5] * geometry.splats[:, 6] * scale
@@ -140,6 +135,11 @@ def _check_view(view: View, near: float) -> None:
     numbers = np.array([view.width, view.height, view.fx, view.fy, view.cx, view.cy, near], np.float64)
     if not np.isfinite(numbers).all() or numbers[:4].min() <= 0 or near <= 0:
         raise ValueError(f"{view.width} x {view.height} px, fx {view.fx}, fy {view.fy}, near {near} m is no camera")
+
+
+def _require_image(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind != "f":
+        raise ValueError(f"{name} is {getattr(array, 'dtype', type(array))} {getattr(array, 'shape', '')}, not float {shape}")
 
 
 def _inputs(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,22 +153,22 @@ def _geometry(gaussians: Gaussians, view: View, near: float) -> Geometry:
     camera = np.array([view.fx, view.fy, view.cx, view.cy, view.width, view.height, *view.position], np.float64)
     splats = np.empty((num, projection.SPLAT_FIELDS))
     levels = np.empty(num, np.int64)
-    rows = np.empty((num, 2), np.int64)
+    boxes = np.empty((num, 4), np.int64)
     num_chunks = max(1, min(64, num // 256))
     projection.project(
-        *_inputs(gaussians), rotation, camera, near, max_levels(view.width, view.height), num_chunks, splats, levels, rows
+        *_inputs(gaussians), rotation, camera, near, max_levels(view.width, view.height), num_chunks, splats, levels, boxes
     )
     pyramid = make_pyramid(view.width, view.height, 1 + max(0, int(levels.max(initial=0))))
-    bins = bin_splats(pyramid, levels, rows)
+    bins = bin_splats(pyramid, levels, boxes)
     return Geometry(
         near=near,
         rotation=rotation,
         camera=camera,
         splats=splats,
         levels=levels,
+        boxes=boxes,
         pyramid=pyramid,
         bins=bins,
-        order=np.argsort(-np.diff(bins.band_starts), kind="stable"),
         num_chunks=num_chunks,
     )
 
@@ -188,25 +188,21 @@ def _drawn(
     amplitudes = np.where(amplitudes > FAINTEST, amplitudes, 0.0).astype(np.float32)
     num_channels = 1 + colors.shape[1]
     buffer = np.empty(num_channels * p.offsets[-1], np.float32)
-    draw(
-        buffer, num_channels, p.rows, p.columns, p.strides, p.offsets, bins.band_levels, bins.band_rows, bins.band_starts,
-        bins.pair_splats, geometry.splats, amplitudes, colors, geometry.order, numba.get_num_threads(),
-    )  # fmt: skip
+    draw(buffer, p, bins, geometry.splats, geometry.boxes, amplitudes, colors, numba.get_num_threads())
     upsample(buffer, p, num_channels)
-    level0 = buffer[: num_channels * p.offsets[1]].reshape(num_channels, p.rows[0], p.strides[0])
-    image = np.ascontiguousarray(level0[:, :, : view.width])
+    image = np.empty((num_channels, view.height, view.width), np.float32)
+    copy_rows(buffer, p.strides[0], image)
     return Splat(image=image, gaussians=gaussians, view=view, features=colors, optical_masses=masses, geometry=geometry)
 
 
-def _gradient_levels(grad_image: np.ndarray, pyramid: Pyramid) -> tuple[np.ndarray, float]:
-    """The gradient on all levels, flat, divided by the largest magnitude, and that magnitude."""
-    num_channels, height, width = grad_image.shape
-    scale = float(np.max(np.abs(grad_image), initial=0.0))
-    buffer = np.empty(num_channels * pyramid.offsets[-1], np.float32)
-    level0 = buffer[: num_channels * pyramid.offsets[1]].reshape(num_channels, height, pyramid.strides[0])
-    level0[:] = 0
-    if scale > 0:
-        scaled = grad_image / scale
-        level0[:, :, :width] = np.where(np.abs(scaled) > FAINTEST, scaled, 0)
-    upsample_adjoint(buffer, pyramid, num_channels)
+def _gradient_levels(name: str, grad_image: np.ndarray, pyramid: Pyramid) -> tuple[np.ndarray, float]:
+    """The gradient [C, H, W] on all levels, flat, divided by its largest magnitude, and that magnitude."""
+    buffer = np.empty(len(grad_image) * pyramid.offsets[-1], np.float32)
+    per_row = np.empty(grad_image.shape[0] * grad_image.shape[1])
+    largest_magnitude(grad_image, per_row)
+    scale = float(np.max(per_row))  # NaN if there is any
+    if not np.isfinite(scale):
+        raise ValueError(f"{name} holds NaN or infinity")
+    scaled_into(grad_image, 1.0 / scale if scale > 0 else 0.0, np.float32(FAINTEST), buffer, pyramid.strides[0])
+    upsample_adjoint(buffer, pyramid, len(grad_image))
     return buffer, scale

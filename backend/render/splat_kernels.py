@@ -17,176 +17,178 @@ from .binning import BAND_ROWS
 from .lanes import LANES, add, exponential, load, muladd, multiply, ramp, spread, store, total
 from .projection import CUT
 
+NARROW = 4 * LANES  # columns
 NUM_SUMS = 6  # of w g (S0), w g t (S1), w g t^2 (S2), w g dy (Y1), w g dy^2 (Y2), w g t dy (X)
 
 
-@njit(cache=True, inline="always")
-def _span(splat, row, num_columns):
-    """First cell of a row, count of cells rounded up to LANES (0: none), x of the row's centre, exponent there, dy."""
-    dy = row - splat[1]
-    exponent = -0.5 * splat[3] * dy * dy
-    centre = splat[0] + splat[4] * dy
-    room = CUT + exponent
-    if room <= 0.0:
-        return 0, 0, centre, exponent, dy
-    half = math.sqrt(2.0 * room / splat[2])
-    low = max(centre - half, 0.0)
-    high = min(centre + half, num_columns - 1.0)
-    if low > high:
-        return 0, 0, centre, exponent, dy
-    first = math.ceil(low)
-    return first, (math.floor(high) - first + LANES) // LANES * LANES, centre, exponent, dy
+@njit(cache=True, forceinline=True)
+def _row(u, v, a, b, s, left, right, row, num_columns):
+    """One row of a splat: first cell, number of cells rounded up to LANES (0: none), t there, exponent at t = 0, dy.
 
-
-@njit(cache=True, parallel=True)
-def draw(buffer, num_channels, rows, columns, strides, offsets, band_levels, band_rows, band_starts, pair_splats, splats,
-         amplitudes, features, order, num_tasks):  # fmt: skip
-    """Writes all bands of buffer (flat, see pyramid.py): channel 0 sum of A w, channel 1 + k sum of A w c_k.
-
-    amplitudes [N] float32, features [N, num_channels - 1] float32. order: the bands, dealt to num_tasks tasks.
+    A narrow splat takes its whole box in every row: finding each row's own span would cost more than it saves.
     """
-    for task in prange(num_tasks):
-        for k in range(task, order.shape[0], num_tasks):
-            band = order[k]
-            level = band_levels[band]
-            stride, num_columns = strides[level], columns[level]
-            plane = rows[level] * stride
-            start = num_channels * offsets[level]
-            first_row = band_rows[band]
-            stop_row = min(first_row + BAND_ROWS, rows[level])
-            for c in range(num_channels):
-                buffer[start + c * plane + first_row * stride : start + c * plane + stop_row * stride] = np.float32(0)
-            for e in range(band_starts[band], band_starts[band + 1]):
-                i = pair_splats[e]
-                if amplitudes[i] != np.float32(0):
-                    _draw_one(
-                        buffer, start, plane, stride, num_columns, first_row, stop_row, splats[i], amplitudes[i], features[i]
-                    )
+    dy = row - v
+    exponent = -0.5 * b * dy * dy
+    centre = u + s * dy
+    if right - left >= NARROW:
+        half = math.sqrt(max(2.0 * (CUT + exponent), 0.0) / a)
+        left = math.ceil(min(max(centre - half, 0.0), float(num_columns)))
+        right = math.floor(max(min(centre + half, num_columns - 1.0), -1.0))
+    count = max(right - left + LANES, 0) & -LANES
+    return left, count, np.float32(left - centre), np.float32(exponent), np.float32(dy)
 
 
 @njit(cache=True)
-def _draw_one(buffer, start, plane, stride, num_columns, first_row, stop_row, splat, amplitude, feature):
-    slope = spread(np.float32(-0.5 * splat[2]))
+def _place(pyramid, bins, band, num_channels):
+    """Of a band: element where its level starts, elements per channel and per row, columns, first row, row after the last."""
+    level = bins.band_levels[band]
+    rows, stride = pyramid.rows[level], pyramid.strides[level]
+    first = bins.band_rows[band]
+    return (
+        num_channels * pyramid.offsets[level],
+        rows * stride,
+        stride,
+        pyramid.columns[level],
+        first,
+        min(first + BAND_ROWS, rows),
+    )
+
+
+@njit(cache=True, parallel=True)
+def draw(buffer, pyramid, bins, splats, boxes, amplitudes, features, num_tasks):
+    """Writes all bands of buffer (flat, see pyramid.py): channel 0 sum of A w, channel 1 + k sum of A w c_k.
+
+    amplitudes [N] float32, features [N, K] float32. The bands are dealt to num_tasks tasks.
+    """
+    num_features = features.shape[1]
+    for task in prange(num_tasks):
+        tints = np.empty(num_features, np.float32)
+        for k in range(task, bins.order.shape[0], num_tasks):
+            band = bins.order[k]
+            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            for c in range(1 + num_features):
+                buffer[start + c * plane + first_row * stride : start + c * plane + stop_row * stride] = np.float32(0)
+            for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
+                i = bins.pair_splats[e]
+                if amplitudes[i] != np.float32(0):
+                    for c in range(num_features):
+                        tints[c] = amplitudes[i] * features[i, c]
+                    low, high = max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)
+                    _draw_one(buffer, start, plane, stride, num_columns, low, high, splats, boxes, i, amplitudes[i], tints)
+
+
+@njit(cache=True, forceinline=True)
+def _draw_one(buffer, start, plane, stride, num_columns, first_row, stop_row, splats, boxes, i, amplitude, tints):
+    u, v, a, b, s = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+    left, right = boxes[i, 2], boxes[i, 3]
+    slope = spread(np.float32(-0.5 * a))
     step = spread(np.float32(LANES))
     strength = spread(amplitude)
-    reach = math.sqrt(2.0 * CUT / splat[3])
-    low = max(first_row, math.ceil(max(splat[1] - reach, 0.0)))
-    high = min(stop_row - 1, math.floor(min(splat[1] + reach, 1e9)))
-    for row in range(low, high + 1):
-        first, count, centre, exponent, _ = _span(splat, row, num_columns)
+    for row in range(first_row, stop_row):
+        first, count, t0, exponent, _ = _row(u, v, a, b, s, left, right, row, num_columns)
+        t = ramp(t0)
+        peak = spread(exponent)
         at = start + row * stride + first
-        t = ramp(np.float32(first - centre))
-        peak = spread(np.float32(exponent))
-        for k in range(0, count, LANES):
-            weight = multiply(exponential(muladd(multiply(t, t), slope, peak)), strength)
-            store(buffer, at + k, add(load(buffer, at + k), weight))
-            for c in range(feature.shape[0]):
-                place = at + k + (c + 1) * plane
-                store(buffer, place, muladd(weight, spread(feature[c]), load(buffer, place)))
+        for place in range(at, at + count, LANES):
+            weight = exponential(muladd(multiply(t, t), slope, peak))
+            store(buffer, place, muladd(weight, strength, load(buffer, place)))
+            for c in range(tints.shape[0]):
+                tinted = place + (c + 1) * plane
+                store(buffer, tinted, muladd(weight, spread(tints[c]), load(buffer, tinted)))
             t = add(t, step)
 
 
 @njit(cache=True, parallel=True)
-def differentiate(gradient, num_channels, rows, strides, columns, offsets, band_levels, band_rows, band_starts, pair_splats,
-                  pair_slots, splats, features, order, num_tasks, slots):  # fmt: skip
-    """Adjoint of draw: slots [P, NUM_SUMS + num_channels - 1] float32, sums over the pair's cells of unit-amplitude terms.
+def differentiate(gradient, pyramid, bins, splats, boxes, features, num_tasks, slots):
+    """Adjoint of draw: slots [P, NUM_SUMS + K] float32, sums over the pair's cells of unit-amplitude terms.
 
     With g = gradient of channel 0 plus sum of c_k times that of channel 1 + k: the six sums, then sum of w g_k for each k.
     """
+    num_features = features.shape[1]
     for task in prange(num_tasks):
-        for k in range(task, order.shape[0], num_tasks):
-            band = order[k]
-            level = band_levels[band]
-            start = num_channels * offsets[level]
-            stop_row = min(band_rows[band] + BAND_ROWS, rows[level])
-            plane = rows[level] * strides[level]
-            for e in range(band_starts[band], band_starts[band + 1]):
-                i = pair_splats[e]
-                slot = slots[pair_slots[e]]
+        scratch = np.empty(LANES * num_features, np.float32)
+        for k in range(task, bins.order.shape[0], num_tasks):
+            band = bins.order[k]
+            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
+                i, slot = bins.pair_splats[e], bins.pair_slots[e]
+                low, high = max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)
                 _differentiate_one(
-                    gradient,
-                    start,
-                    strides[level],
-                    columns[level],
-                    plane,
-                    band_rows[band],
-                    stop_row,
-                    splats[i],
-                    features[i],
-                    slot,
-                )
+                    gradient, start, plane, stride, num_columns, low, high, splats, boxes, i, features, scratch, slots, slot
+                )  # fmt: skip
 
 
-@njit(cache=True)
-def _differentiate_one(gradient, start, stride, num_columns, plane, first_row, stop_row, splat, feature, slot):
+@njit(cache=True, forceinline=True)
+def _differentiate_one(
+    gradient, start, plane, stride, num_columns, first_row, stop_row, splats, boxes, i, features, scratch, slots, slot
+):
+    u, v, a, b, s = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+    left, right = boxes[i, 2], boxes[i, 3]
+    num_features = features.shape[1]
     zero = spread(np.float32(0))
-    slope = spread(np.float32(-0.5 * splat[2]))
+    slope = spread(np.float32(-0.5 * a))
     step = spread(np.float32(LANES))
     s0, s1, s2, y1, y2, x1 = zero, zero, zero, zero, zero, zero
-    for c in range(feature.shape[0]):
-        slot[NUM_SUMS + c] = np.float32(0)
-    reach = math.sqrt(2.0 * CUT / splat[3])
-    low = max(first_row, math.ceil(max(splat[1] - reach, 0.0)))
-    high = min(stop_row - 1, math.floor(min(splat[1] + reach, 1e9)))
-    for row in range(low, high + 1):
-        first, count, centre, exponent, dy = _span(splat, row, num_columns)
-        at = start + row * stride + first
-        t = ramp(np.float32(first - centre))
-        peak = spread(np.float32(exponent))
+    for c in range(num_features):
+        store(scratch, c * LANES, zero)
+    for row in range(first_row, stop_row):
+        first, count, t0, exponent, dy = _row(u, v, a, b, s, left, right, row, num_columns)
+        t = ramp(t0)
+        peak = spread(exponent)
         r0, r1, r2 = zero, zero, zero
-        for k in range(0, count, LANES):
+        at = start + row * stride + first
+        for place in range(at, at + count, LANES):
             square = multiply(t, t)
             weight = exponential(muladd(square, slope, peak))
-            g = load(gradient, at + k)
-            for c in range(feature.shape[0]):
-                g_c = load(gradient, at + k + (c + 1) * plane)
-                g = muladd(spread(feature[c]), g_c, g)
-                slot[NUM_SUMS + c] += total(multiply(weight, g_c))
+            g = load(gradient, place)
+            for c in range(num_features):
+                g_c = load(gradient, place + (c + 1) * plane)
+                g = muladd(spread(features[i, c]), g_c, g)
+                store(scratch, c * LANES, muladd(weight, g_c, load(scratch, c * LANES)))
             weighted = multiply(weight, g)
             r0 = add(r0, weighted)
             r1 = muladd(weighted, t, r1)
             r2 = muladd(weighted, square, r2)
             t = add(t, step)
-        height = spread(np.float32(dy))
+        height = spread(dy)
         s0, s1, s2 = add(s0, r0), add(s1, r1), add(s2, r2)
         r0 = multiply(r0, height)
         y1 = add(y1, r0)
         y2 = muladd(r0, height, y2)
         x1 = muladd(r1, height, x1)
-    slot[0], slot[1], slot[2], slot[3], slot[4], slot[5] = total(s0), total(s1), total(s2), total(y1), total(y2), total(x1)
+    slots[slot, 0], slots[slot, 1], slots[slot, 2] = total(s0), total(s1), total(s2)
+    slots[slot, 3], slots[slot, 4], slots[slot, 5] = total(y1), total(y2), total(x1)
+    for c in range(num_features):
+        slots[slot, NUM_SUMS + c] = total(load(scratch, c * LANES))
 
 
 @njit(cache=True, parallel=True)
-def weigh(gradient, rows, strides, columns, offsets, band_levels, band_rows, band_starts, pair_splats, pair_slots, splats,
-          order, num_tasks, slots):  # fmt: skip
+def weigh(gradient, pyramid, bins, splats, boxes, num_tasks, slots):
     """As differentiate, but only the sums of w g of one channel: slots [P]."""
     for task in prange(num_tasks):
-        for k in range(task, order.shape[0], num_tasks):
-            band = order[k]
-            level = band_levels[band]
-            stop_row = min(band_rows[band] + BAND_ROWS, rows[level])
-            for e in range(band_starts[band], band_starts[band + 1]):
-                slots[pair_slots[e]] = _weigh_one(
-                    gradient, offsets[level], strides[level], columns[level], band_rows[band], stop_row, splats[pair_splats[e]]
-                )
+        for k in range(task, bins.order.shape[0], num_tasks):
+            band = bins.order[k]
+            start, _, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1)
+            for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
+                i = bins.pair_splats[e]
+                low, high = max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)
+                slots[bins.pair_slots[e]] = _weigh_one(gradient, start, stride, num_columns, low, high, splats, boxes, i)
 
 
-@njit(cache=True)
-def _weigh_one(gradient, start, stride, num_columns, first_row, stop_row, splat):
-    slope = spread(np.float32(-0.5 * splat[2]))
+@njit(cache=True, forceinline=True)
+def _weigh_one(gradient, start, stride, num_columns, first_row, stop_row, splats, boxes, i):
+    u, v, a, b, s = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+    left, right = boxes[i, 2], boxes[i, 3]
+    slope = spread(np.float32(-0.5 * a))
     step = spread(np.float32(LANES))
     s0 = spread(np.float32(0))
-    reach = math.sqrt(2.0 * CUT / splat[3])
-    low = max(first_row, math.ceil(max(splat[1] - reach, 0.0)))
-    high = min(stop_row - 1, math.floor(min(splat[1] + reach, 1e9)))
-    for row in range(low, high + 1):
-        first, count, centre, exponent, _ = _span(splat, row, num_columns)
+    for row in range(first_row, stop_row):
+        first, count, t0, exponent, _ = _row(u, v, a, b, s, left, right, row, num_columns)
+        t = ramp(t0)
+        peak = spread(exponent)
         at = start + row * stride + first
-        t = ramp(np.float32(first - centre))
-        peak = spread(np.float32(exponent))
-        for k in range(0, count, LANES):
-            weight = exponential(muladd(multiply(t, t), slope, peak))
-            s0 = muladd(weight, load(gradient, at + k), s0)
+        for place in range(at, at + count, LANES):
+            s0 = muladd(exponential(muladd(multiply(t, t), slope, peak)), load(gradient, place), s0)
             t = add(t, step)
     return total(s0)
 
@@ -202,3 +204,37 @@ def gather(slots, slot_starts, num_chunks, sums):
                 for slot in range(slot_starts[i], slot_starts[i + 1]):
                     value += slots[slot, f]
                 sums[i, f] = value
+
+
+@njit(cache=True, parallel=True)
+def largest_magnitude(image, per_row):
+    """per_row [C H]: largest |value| in each row of image [C, H, W]; NaN where a number is not finite."""
+    num_rows = image.shape[1]
+    for r in prange(per_row.shape[0]):
+        line = image[r // num_rows, r % num_rows]
+        largest, nothing = line[0] * 0, line[0] * 0
+        for x in range(line.shape[0]):
+            largest = max(largest, abs(line[x]))
+            nothing += line[x] * 0
+        per_row[r] = largest + nothing
+
+
+@njit(cache=True, parallel=True)
+def scaled_into(image, factor, smallest, out, stride):
+    """out (flat, rows of `stride` elements): image [C, H, W] times factor, 0 below smallest; zeros beyond the width."""
+    num_channels, num_rows, width = image.shape
+    for r in prange(num_channels * num_rows):
+        line = image[r // num_rows, r % num_rows]
+        for x in range(width):
+            value = np.float32(line[x] * factor)
+            out[r * stride + x] = value if abs(value) > smallest else np.float32(0)
+        for x in range(width, stride):
+            out[r * stride + x] = np.float32(0)
+
+
+@njit(cache=True, parallel=True)
+def copy_rows(source, stride, image):
+    """image [C, H, W] from the flat `source` with rows of `stride` elements."""
+    num_channels, num_rows, width = image.shape
+    for r in prange(num_channels * num_rows):
+        image[r // num_rows, r % num_rows] = source[r * stride : r * stride + width]
