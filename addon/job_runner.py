@@ -30,6 +30,7 @@ from ..backend.contract.running import running_pid
 MAX_EVENTS_PER_POLL = 500  # decoded already; more would hold up Blender's redraw
 MAX_WAITING_EVENTS = 2000  # beyond it the pipe fills and the backend waits
 MAX_NOISE_BYTES = 1 << 20  # of lines that are no events, kept in the log
+NOISE_PREFIX = "[stdout] "
 PATIENCE_AFTER_CANCEL = 8.0  # s until a backend that ignores a cancel is ended
 PATIENCE_AFTER_LAST = 3.0  # s until a backend that said its last word, or closed its output, is ended
 PATIENCE_AFTER_EXIT = 1.0  # s to wait for output that a grandchild still holds open
@@ -261,7 +262,7 @@ class JobRunner:
 
     def _log_noise(self, line: bytes) -> None:
         with contextlib.suppress(OSError), open(self.log, "ab") as log:
-            log.write(b"[stdout] " + line[:4096].rstrip(b"\r\n") + b"\n")
+            log.write(NOISE_PREFIX.encode() + line[:4096].rstrip(b"\r\n") + b"\n")
 
 
 def final_state(last_event: events.Event | None, was_cancelling: bool) -> RunState:

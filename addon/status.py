@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, replace
 
 from ..backend.contract import events
-from .job_runner import RunState
+from .job_runner import NOISE_PREFIX, RunState
 from .job_state import JobKind, JobState
 
 MAX_SECONDS = 1e7  # nobody waits longer; also keeps absurd numbers out of the arithmetic
@@ -111,7 +111,8 @@ def ended(status: JobStatus, state: RunState, *, log_tail: list[str], log: str, 
         case RunState.CANCELLED:
             return replace(status, phase=Phase.CANCELLED, message="", hint="", seconds_left=None)
         case _:
-            reason = f" Its last words: {log_tail[-1]}" if log_tail else ""
+            words = [line for line in log_tail if not line.startswith(NOISE_PREFIX)]
+            reason = f" Its last words: {words[-1]}" if words else ""
             return replace(
                 status,
                 phase=Phase.CRASHED,

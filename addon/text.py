@@ -14,7 +14,7 @@ def characters_across(context: bpy.types.Context) -> int:
     """How many characters a line of the region holds."""
     region = context.region
     width = region.width if region is not None else 300
-    scale = context.preferences.system.ui_scale
+    scale = context.preferences.system.ui_scale or 1.0  # 0 where there is no window
     return max(int((width / scale - MARGIN_PIXELS) / PIXELS_PER_CHARACTER), 16)
 
 
