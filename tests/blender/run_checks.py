@@ -5,7 +5,6 @@ Called as `python run_checks.py inside_x.py out.json`. Standard library and bpy 
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import json
 import sys
@@ -32,15 +31,19 @@ def main(script: Path, out: Path) -> int:
             continue
         bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
         with tempfile.TemporaryDirectory() as folder:
-            report[name] = problem_of(functools.partial(check, Path(folder)))
+            report[name] = problem_of(check, Path(folder))
         out.write_text(json.dumps(report))
     return 0
 
 
-def problem_of(check: Callable[[], None]) -> str | None:
+def problem_of(check: Callable[[Path], None], folder: Path) -> str | None:
     """The traceback of a failure of any kind, None if there is none."""
+
+    def run() -> None:
+        check(folder)
+
     result = unittest.TestResult()
-    unittest.FunctionTestCase(check).run(result)
+    unittest.FunctionTestCase(run).run(result)
     return next((text for _, text in result.failures + result.errors), None)
 
 
