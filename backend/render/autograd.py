@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-
 from backend.geometry.camera import View
+from torch import Tensor
 
 from . import projection, splat
 from .gaussians import Gaussians

@@ -40,6 +40,6 @@ def _quotient(tau: np.ndarray) -> np.ndarray:
 
 def _quotient_slope(tau: np.ndarray) -> np.ndarray:
     """Derivative of _quotient: (exp(-tau) - quotient) / tau, -1/2 at 0; by its series where the difference cancels."""
-    safe = np.maximum(tau, _SERIES_BELOW)
-    series = -0.5 + tau * (1 / 3 - tau * (1 / 8 - tau / 30))
+    safe, small = np.maximum(tau, _SERIES_BELOW), np.minimum(tau, _SERIES_BELOW)
+    series = -0.5 + small * (1 / 3 - small * (1 / 8 - small / 30))
     return np.where(tau < _SERIES_BELOW, series, (np.exp(-safe) - _quotient(safe)) / safe).astype(tau.dtype)
