@@ -16,11 +16,14 @@ from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, 
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.state import VisualRecord
+from backend.geometry.camera import View
 from backend.render import splat as renderer
 
 SCALE_SHARE = 0.6  # standard deviation of a particle at birth, share of the mean spacing
 DEATH_SHARE = 0.02  # of a particle's own share of the smoke: below it a particle is spent
 BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fill detail
+CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
+CALM_COLOR = 0.25  # share of the way to the colour of its pixel
 
 
 class Appearance:
@@ -62,6 +65,7 @@ class Appearance:
         """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
+        record = self._calmed(record, layer, view)
         kept = config.consistency if consistency is None else consistency
         record = self._weighed(record, frame, target, consistency=kept)
         record = self._births(record, frame, target)
@@ -69,6 +73,26 @@ class Appearance:
         if config.iterations == 0:
             return record, 0.0
         return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale)
+
+    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View) -> VisualRecord:
+        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows.
+
+        Behind the surface of thick smoke nothing holds single particles, and noise would gather in them from frame to
+        frame. The fit that follows restores what the view does tell.
+        """
+        if len(record.positions) == 0:
+            return record
+        masses = record.optical_masses.astype(np.float64)
+        common = float(np.exp(np.mean(np.log(np.maximum(masses, 1e-3 * self.unit_mass)))))
+        calmed = masses ** (1.0 - CALM_MASS) * common**CALM_MASS
+        pixels, _ = view.project(record.positions)
+        columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
+        rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
+        seen, opacity = layer[rows, columns, :3], layer[rows, columns, 3:]
+        shown = seen / np.maximum(opacity, 0.02)
+        share = CALM_COLOR * (opacity > 0.05)
+        colors = (1.0 - share) * record.colors + share * shown
+        return replace(record, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
 
     def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
         """Masses after the frame was seen, without the spent and the departed."""

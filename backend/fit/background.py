@@ -10,6 +10,7 @@ import numpy as np
 
 from backend.contract.job import ExtractionConfig
 from backend.fit.clean_plate import CleanPlate, fill_smoothly, frame_noise, temporal_plate
+from backend.fit.matting import SmokeColor, estimate_smoke_color
 from backend.fit.sky import Sky, fit_sky
 from backend.fit.stabilise import ImageMotion, measure_motion, warp
 from backend.io.images import linear_to_srgb, read_linear, srgb_to_linear
@@ -120,6 +121,9 @@ def _over_time(
         samples.append(image if motion.is_still else warp(image, motion.between(number)))
         on_step(step, len(numbers))
     plate = temporal_plate(samples)
+    smoke = _smoke_before(plate, samples)
+    if smoke is not None:
+        plate = temporal_plate(samples, smoke=smoke.linear)
     measured |= {
         "plate_seen_share": float(plate.is_seen.mean()),
         "plate_noise": plate.noise,
@@ -130,6 +134,12 @@ def _over_time(
     return Background(
         plate=plate, motion=motion, skies=[], sky_frames=[], noise=plate.noise, is_temporal=True, reason=reason, measured=measured
     )
+
+
+def _smoke_before(plate: CleanPlate, samples: list[np.ndarray]) -> SmokeColor | None:
+    """A first guess of the smoke's colour, where the plate was seen."""
+    images = [np.where(np.isfinite(sample), sample, plate.color) for sample in samples[:: max(1, len(samples) // 16)]]
+    return estimate_smoke_color(images, [plate.color] * len(images), [plate.is_seen] * len(images), plate.noise)
 
 
 def _before_sky(

@@ -12,6 +12,8 @@ import numpy as np
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 _MODE_SHARE = 0.25  # of the frames that must agree: smoke may cover a pixel three quarters of the time
+_FEW_SHARE = 0.1  # of the frames: as many must agree where the others are known to be smoke
+_LIKE_SMOKE = 0.08  # sRGB code, every channel: the shading of opaque smoke
 _MIN_NOISE = 0.5 / 255  # sRGB code; half a step of 8 bits
 _MAX_SPREAD = 4.0  # noise levels; frames that agree less than this show no background
 _BAND_VALUES = 8_000_000  # temporal statistics are taken over bands of rows of this size
@@ -30,18 +32,21 @@ class CleanPlate:
     activity: np.ndarray
 
 
-def temporal_plate(samples: Sequence[np.ndarray]) -> CleanPlate:
+def temporal_plate(samples: Sequence[np.ndarray], *, smoke: np.ndarray | None = None) -> CleanPlate:
     """The plate of frames [h, w, 3] linear that lie on each other (NaN where a frame does not reach).
 
     Per pixel the shortest interval that holds a quarter of the frames (the half-sample mode of Bickel & Fruehwirth
     2006, with a quarter) is centred on the value that repeats best: the background repeats to within noise, smoke in
     front of it does not, whether it brightens or darkens. The plate is the mean of the frames that agree with it.
+    smoke: [3] linear colour of opaque smoke, once known; opaque smoke repeats too, so values like it count last.
     """
     coded = [linear_to_srgb(frame[..., :3]).astype(np.float32) for frame in samples]
     noise = frame_noise(coded)
+    smoke_coded = None if smoke is None else linear_to_srgb(smoke).astype(np.float32)
     height, width = coded[0].shape[:2]
     rows = max(1, _BAND_VALUES // (len(coded) * width * 3))
-    parts = [_band(np.stack([c[top : top + rows] for c in coded]), noise) for top in range(0, height, rows)]
+    bands = (np.stack([c[top : top + rows] for c in coded]) for top in range(0, height, rows))
+    parts = [_band(band, noise, smoke_coded) for band in bands]
     color, is_seen, activity = (np.concatenate([part[k] for part in parts]) for k in range(3))
     color = fill_smoothly(color, is_seen)
     return CleanPlate(color=srgb_to_linear(color).astype(np.float32), is_seen=is_seen, noise=noise, activity=activity)
@@ -53,29 +58,41 @@ def frame_noise(coded: Sequence[np.ndarray]) -> float:
     return max(float(np.median(spreads)), _MIN_NOISE)
 
 
-def _band(coded: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _band(coded: np.ndarray, noise: float, smoke: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frames [n, r, w, 3] coded -> plate [r, w, 3] coded, seen [r, w], activity [r, w]."""
     luma = coded @ LUMINANCE
-    ordered = np.sort(luma, axis=0)  # NaN comes last
     num = np.isfinite(luma).sum(axis=0)
-    length = max(3, round(_MODE_SHARE * len(coded)))
-    if len(coded) <= length:
-        length = max(2, len(coded) - 1)
-    widths = ordered[length - 1 :] - ordered[: len(coded) - length + 1]
-    widths = np.where(np.isfinite(widths), widths, np.inf)
-    best = widths.argmin(axis=0)[None]
-    low = np.take_along_axis(ordered, best, axis=0)
-    high = np.take_along_axis(ordered, best + length - 1, axis=0)
-    spread = (high - low)[0]
-    centre = 0.5 * (low + high)
-    agrees = np.abs(luma - centre) < np.maximum(0.5 * (high - low), 0.0) + 2.0 * noise
+    length = min(max(3, round(_MODE_SHARE * len(coded))), max(2, len(coded) - 1))
+    centre, spread = shortest_interval(luma, length)
+    is_smoke = np.zeros(centre.shape, bool)
+    if smoke is not None:
+        is_like_smoke = np.abs(coded - smoke).max(axis=-1) < _LIKE_SMOKE
+        few = max(3, round(_FEW_SHARE * len(coded)))
+        other_centre, other_spread = shortest_interval(np.where(is_like_smoke, np.nan, luma), few)
+        is_better = other_spread < 0.5 * _MAX_SPREAD * noise
+        is_smoke = ~is_better & (is_like_smoke.mean(axis=0) > _FEW_SHARE) & (is_like_smoke.mean(axis=0) < 1.0 - _FEW_SHARE)
+        centre, spread = np.where(is_better, other_centre, centre), np.where(is_better, other_spread, spread)
+    agrees = np.abs(luma - centre) < 0.5 * np.minimum(spread, 1.0) + 2.0 * noise
     weight = agrees[..., None].astype(np.float32)
     color = np.where(weight > 0, coded, 0.0).sum(axis=0) / np.maximum(weight.sum(axis=0), 1.0)
-    # A quarter of normally distributed values lies within 0.64 of their deviation.
-    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise)
+    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise) & ~is_smoke
     differs = np.abs(coded - color).max(axis=-1) > 5.0 * noise
     activity = differs.sum(axis=0) / np.maximum(num, 1)
     return color.astype(np.float32), is_seen, activity.astype(np.float32)
+
+
+def shortest_interval(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and width [...] of the shortest interval that holds `length` of values [n, ...]; NaN are none of them.
+
+    Infinite width and centre 0 where there are fewer values.
+    """
+    ordered = np.sort(values, axis=0)  # NaN comes last
+    widths = ordered[length - 1 :] - ordered[: len(values) - length + 1]
+    widths = np.where(np.isfinite(widths), widths, np.inf)
+    best = widths.argmin(axis=0)[None]
+    low = np.take_along_axis(ordered, best, axis=0)[0]
+    high = np.take_along_axis(ordered, best + length - 1, axis=0)[0]
+    return np.nan_to_num(0.5 * (low + high)), np.take_along_axis(widths, best, axis=0)[0]
 
 
 def fill_smoothly(image: np.ndarray, is_known: np.ndarray) -> np.ndarray:

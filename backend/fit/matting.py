@@ -15,6 +15,7 @@ from backend.fit.connected import components
 from backend.io.images import LUMINANCE
 
 _OPACITY_SPREAD = 1.0  # prior deviation of opacity around 0: holds it down where J and S look alike
+_MOVING_NOISE = 5.0 / 255  # sRGB code: video codecs spend few bits on what moves, above all on its colour
 _ROUNDS = 3  # the spread of the brightness term depends on the opacity itself
 _MIN_COLOR_PIXELS = 64
 
@@ -34,7 +35,7 @@ class SmokeColor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Opacity:
-    """value: [h, w] 0..1, unfiltered. deviation: [h, w] its standard deviation from noise alone.
+    """value: [h, w] 0..1, unfiltered. deviation: [h, w] what noise alone makes of no smoke (standard deviation).
 
     explained: [h, w] 0..1, how much of the difference from the background smoke accounts for.
     """
@@ -61,7 +62,7 @@ def solve_opacity(
     sum_k ((a J_k - u c_k - (J_k - I_k)) / noise_k)^2 + ((u - brightness a) / (spread a))^2 + (a / opacity spread)^2.
     For spread -> 0 this is a = (J - I).(J - S) / |J - S|^2, the transmittance formula of METHOD solved for opacity.
     """
-    weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), noise) ** 2
+    weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), max(noise, _MOVING_NOISE)) ** 2
     difference = background - image
     direction = smoke.direction.astype(np.float32)
     jj = (weight * background * background).sum(axis=2)
@@ -82,7 +83,8 @@ def solve_opacity(
     residual = (weight * (opacity[..., None] * background - light[..., None] * direction - difference) ** 2).sum(axis=2)
     total = (weight * difference * difference).sum(axis=2)
     explained = np.clip(1.0 - residual / np.maximum(total, 3.0), 0.0, 1.0)
-    deviation = np.sqrt(a22 / determinant)  # the inverse of the normal matrix, element a a
+    # The element a a of the inverse of the normal matrix, at the noise of the background: that is where it is needed.
+    deviation = np.sqrt(a22 / determinant) * (noise / max(noise, _MOVING_NOISE))
     return Opacity(value=opacity, deviation=deviation.astype(np.float32), explained=explained.astype(np.float32))
 
 

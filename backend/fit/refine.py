@@ -20,7 +20,7 @@ LOG_STEP = 0.06  # of log mass, an iteration
 LOG_SCALE_STEP = 0.02
 COLOR_STEP = 0.02
 POSITION_PULL = 0.05  # strength of the pull to the carried position, in units of the data term's own gradient
-SCALE_RANGE = (0.5, 2.0)  # of the scale at birth
+SCALE_RANGE = (0.6, 2.0)  # of the scale at birth
 
 
 @dataclass(slots=True)

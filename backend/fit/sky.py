@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.interpolate import BSpline
+from scipy.ndimage import convolve1d
 
+from backend.fit.clean_plate import shortest_interval
 from backend.io.images import linear_to_srgb
 
 MIN_SKY_SHARE = 0.1  # of the picture; less is no sky to speak of
@@ -16,6 +18,9 @@ _KNOTS = 24  # cubic spline pieces over the height of the picture
 _ACROSS = 2  # degree of the polynomial across: a sky changes with height, and little sideways
 _STIFFNESS = 0.3  # of the spline, per clear pixel; continues straight where there is no clear sky
 _TOLERANCE = 3.0 / 255  # sRGB code, that clear sky may differ from a smooth gradient (banding, coding blocks)
+_BELT_ROUNDS = 3
+_BELT_SHARE = 0.25  # of a row's pixels that must agree
+_MAX_BELT = 40.0 / 255  # sRGB code: haze does not differ more from the sky above it
 _MAX_STEP = 3  # rows that the skyline may rise or fall a column
 _STEP_COST = 0.15  # per row
 _EDGE_GAIN = 8.0
@@ -60,9 +65,34 @@ def fit_sky(image: np.ndarray) -> Sky | None:
         is_clear = _connected_with_top(is_near)
     if is_clear.mean() < MIN_SKY_SHARE:
         return None
-    residual = float(np.sqrt(np.mean((coded - model)[is_clear] ** 2)))
     line = _skyline(coded, is_clear)
+    for _ in range(_BELT_ROUNDS):
+        is_clear = _with_haze_belt(smooth, model, is_clear, line)
+        model = _fit(smooth, down, across, is_clear)
+    line = _skyline(coded, is_clear)
+    residual = float(np.sqrt(np.mean((coded - model)[is_clear] ** 2)))
     return Sky(coded=model, is_clear=is_clear, skyline=line, residual=residual)
+
+
+def _with_haze_belt(smooth: np.ndarray, model: np.ndarray, is_clear: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the clear pixels, and of the rows between them and the skyline those that agree along their row.
+
+    Close above the horizon haze bends the gradient faster than the turns before could follow, but it bends it alike
+    over the width of the picture; smoke does not. A row's own value is the one that most of its pixels share.
+    """
+    height, width = is_clear.shape
+    is_above = np.arange(height)[:, None] < line - 1
+    num_above = is_above.sum(axis=1)
+    is_covered = (is_clear.sum(axis=1) >= 0.5 * num_above) & (num_above > 0)
+    if not is_covered.any():
+        return is_clear
+    is_belt = (np.arange(height) > np.flatnonzero(is_covered).max())[:, None] & is_above
+    difference = np.where(is_belt[..., None], smooth - model, np.nan)
+    length = max(4, round(_BELT_SHARE * width))
+    centre, spread = shortest_interval(difference.transpose(1, 0, 2), length)
+    is_row = (spread.max(axis=1) < 2.0 * _TOLERANCE) & (np.abs(centre).max(axis=1) < _MAX_BELT)
+    is_near = np.abs(difference - centre[:, None, :]).max(axis=2) < _TOLERANCE
+    return (is_clear & ~is_belt) | (is_near & is_row[:, None])
 
 
 def _bases(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -140,12 +170,12 @@ def _ground_likeness(coded: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
     )
     bins = np.clip((features * _TERRAIN_BINS).astype(int), 0, _TERRAIN_BINS - 1)
     shape = (_TERRAIN_BINS,) * 4
-    flat = np.ravel_multi_index(tuple(np.moveaxis(bins, 2, 0)), shape)
+    flat = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(bins, 2, 0)), shape))
 
     def histogram(pixels: np.ndarray) -> np.ndarray:
         counts = np.bincount(pixels.ravel(), minlength=_TERRAIN_BINS**4).reshape(shape).astype(np.float32)
         for axis in range(4):
-            counts = np.apply_along_axis(lambda v: np.convolve(v, [0.25, 0.5, 0.25], mode="same"), axis, counts)
+            counts = convolve1d(counts, [0.25, 0.5, 0.25], axis=axis, mode="constant")
         return counts.ravel() / max(counts.sum(), 1.0) + 1e-5
 
     ground = histogram(flat[ground_from:])

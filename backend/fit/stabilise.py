@@ -15,6 +15,7 @@ MIN_TRACKS = 12  # fewer tell nothing about the camera
 STILL_SHARE = 0.0025  # of the longest side: a camera on a tripod in wind
 _LOST_SHARE = 0.4  # of the tracks gone: take new ones
 _INLIER_PX = 1.5
+_MIN_CORNER = 1e-6  # smallest eigenvalue of the structure tensor, of sRGB code 0..1: about one step of 8 bits a pixel
 _SMOKE_OPACITY = 0.02  # from here on a pixel is smoke and tells nothing about the camera
 _PARALLAX_SHARE = 0.0015  # of the longest side: beyond it no single homography holds the background
 
@@ -91,11 +92,10 @@ def measure_motion(
         homography, inliers = _fit(matched[0][is_found], key_points[is_found])
         to_first[step] = key_to_first @ homography
         to_first[step] /= to_first[step, 2, 2]
-        mapped = _apply(homography, matched[0][is_found])
-        distances = np.linalg.norm(mapped - key_points[is_found], axis=1)
-        errors.append(float(np.median(distances)))
-        first = _apply(to_first[step], matched[0][is_found][inliers])
-        shifts.append(float(np.median(np.linalg.norm(first - matched[0][is_found][inliers], axis=1))))
+        found = matched[0][is_found]
+        if not (homography == np.eye(3)).all():  # what moves before a still camera is no parallax
+            errors.append(float(np.median(np.linalg.norm(_apply(homography, found) - key_points[is_found], axis=1))))
+        shifts.append(float(np.median(np.linalg.norm(_apply(to_first[step], found[inliers]) - found[inliers], axis=1))))
         counts.append(int(is_found.sum()))
         if is_found.mean() < _LOST_SHARE:
             key_points = None
@@ -139,11 +139,24 @@ def _gray(frame: np.ndarray) -> np.ndarray:
 
 
 def _corners(gray: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """[N, 2] px, pixel centres at +0.5, spread over the picture."""
-    spacing = max(4.0, max(gray.shape) / 60.0)
-    allowed = None if mask is None else mask.astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(gray, MAX_TRACKS, 0.01, spacing, mask=allowed)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2) + np.float32(0.5)
+    """[N, 2] px, pixel centres at +0.5: the best corner of each cell of a grid that has one.
+
+    One vote a cell, so that contrasty smoke does not outvote a faint background.
+    """
+    quality = cv2.cornerMinEigenVal(cv2.GaussianBlur(gray, (0, 0), 0.8).astype(np.float32) / 255.0, 5)
+    if mask is not None:
+        quality = np.where(mask, quality, 0.0)
+    edge = 5
+    quality[:edge], quality[-edge:], quality[:, :edge], quality[:, -edge:] = 0.0, 0.0, 0.0, 0.0
+    cell = max(6, round((gray.size / MAX_TRACKS) ** 0.5))
+    height, width = (side // cell * cell for side in gray.shape)
+    cells = quality[:height, :width].reshape(height // cell, cell, width // cell, cell).transpose(0, 2, 1, 3)
+    cells = cells.reshape(height // cell, width // cell, -1)
+    best = cells.argmax(axis=2)
+    rows, columns = np.nonzero(cells.max(axis=2) > _MIN_CORNER)
+    inside = best[rows, columns]
+    points = np.stack([columns * cell + inside % cell, rows * cell + inside // cell], axis=1)
+    return points.astype(np.float32) + np.float32(0.5)
 
 
 def _track(before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,14 +173,17 @@ def _track(before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.
 
 
 def _fit(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Homography [3, 3] points -> targets and its inliers [N] bool; the identity where most points did not move."""
+    """Homography [3, 3] points -> targets and its inliers [N] bool; the identity where about as many did not move."""
     is_still = np.linalg.norm(points - targets, axis=1) < 0.5
     if is_still.mean() > 0.5:
         return np.eye(3), is_still
-    homography, inliers = cv2.findHomography(points, targets, cv2.RANSAC, _INLIER_PX)
+    homography, mask = cv2.findHomography(points, targets, cv2.RANSAC, _INLIER_PX)
+    inliers = mask.ravel() == 1
     if homography is None or not np.isfinite(homography).all() or abs(np.linalg.det(homography)) < 1e-6:
-        return np.eye(3), np.ones(len(points), bool)
-    return homography, inliers.ravel() == 1
+        return np.eye(3), is_still
+    if is_still.sum() > 0.8 * inliers.sum():
+        return np.eye(3), is_still
+    return homography, inliers
 
 
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
