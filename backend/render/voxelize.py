@@ -6,9 +6,10 @@ Symbols: m_i optical mass [m^2], G_i unit Gaussian of covariance S_i, h voxel si
     a(x_v)     = sum_i m_i w_iv a_i / sum_i m_i w_iv                             velocity, colour
 
 The weights of a particle sum to one over the lattice, so that sum_v sigma h^3 = sum_i m_i whatever the voxel size.
-A Gaussian narrower than 0.6 voxels is widened to that: below, a lattice cannot show where it is. Slabs of the grid
-along x are filled in parallel, each by one thread in the order of the particles: no atomics, equal bytes for any
-number of threads.
+Renderers interpolate linearly between voxels, which widens what they see by the variance h^2/6 of a triangle; the
+Gaussians are narrowed by it beforehand. One that would be narrower than 0.6 voxels is widened to that: below, a
+lattice cannot show where it is. Slabs of the grid along x are filled in parallel, each by one thread in the order of
+the particles: no atomics, equal bytes for any number of threads.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from backend.io.particles import ParticleFrame
 CUTOFF = 3.0  # standard deviations; what lies beyond (0.8 % of a Gaussian) is shared out within
 MIN_SCALE_VOXELS = 0.6
 
+_INTERPOLATION_VARIANCE = 1.0 / 6.0  # voxels^2, of the triangle of width 2 that linear interpolation convolves with
 _SLAB = 4  # voxels along x filled by one thread at a time
 _WIDE_AXIS = 64.0  # voxels; a sum over the lattice equals the integral to 1e-4 from here on: one voxel at the cutoff
 _WIDE = 8.0  # voxels, the same for an ellipsoid, whose surface averages over many voxels
@@ -71,11 +73,12 @@ def voxelize(frame: ParticleFrame, lattice: Lattice, *, with_color: bool = False
 
 
 def _covariance_factors(frame: ParticleFrame, voxel_size: float) -> np.ndarray:  # [N, 3, 3] voxels
-    """M with covariance M M^T in voxels, its axes at least MIN_SCALE_VOXELS long."""
+    """M with covariance M M^T in voxels: narrowed for linear interpolation, its axes at least MIN_SCALE_VOXELS long."""
     scales = np.asarray(frame.scales, np.float64) / voxel_size
     if scales.ndim == 1:
         scales = np.repeat(scales[:, None], 3, axis=1)
-    return rotation_matrices(frame.rotations, len(scales)) * np.maximum(scales, MIN_SCALE_VOXELS)[:, None, :]
+    axes = np.sqrt(np.maximum(scales * scales - _INTERPOLATION_VARIANCE, MIN_SCALE_VOXELS**2))
+    return rotation_matrices(frame.rotations, len(scales)) * axes[:, None, :]
 
 
 def rotation_matrices(quaternions: np.ndarray | None, count: int) -> np.ndarray:  # [N, 3, 3]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from backend.io.particles import ParticleFrame
 from backend.render.voxelize import CUTOFF, MIN_SCALE_VOXELS, Lattice, rotation_matrices, splat_extents, voxelize
@@ -39,6 +40,11 @@ def particles(
     )
 
 
+def drawn_scale(scale: float) -> float:
+    """In voxels: narrowed by what linear interpolation widens it, but not below MIN_SCALE_VOXELS."""
+    return math.sqrt(max(scale**2 - 1 / 6, MIN_SCALE_VOXELS**2))
+
+
 def reference(frame: ParticleFrame, lattice: Lattice) -> dict[str, np.ndarray]:
     """Loops over particles and voxels in float64, weights summed over a lattice that nothing is cut off by."""
     h, shape = lattice.voxel_size, lattice.shape
@@ -46,7 +52,7 @@ def reference(frame: ParticleFrame, lattice: Lattice) -> dict[str, np.ndarray]:
     turns = rotation_matrices(frame.rotations, frame.count)
     for p in range(frame.count):
         center = (frame.positions[p] - np.array(lattice.origin)) / h
-        axes = np.maximum(np.broadcast_to(np.float64(frame.scales[p]), 3) / h, MIN_SCALE_VOXELS)
+        axes = np.array([drawn_scale(float(scale) / h) for scale in np.broadcast_to(frame.scales[p], 3)])
         covariance = turns[p] @ np.diag(axes**2) @ turns[p].T
         precision, half = np.linalg.inv(covariance), CUTOFF * np.sqrt(np.diag(covariance))
         ranges = [range(math.ceil(c - w), math.floor(c + w) + 1) for c, w in zip(center, half, strict=True)]
@@ -90,12 +96,13 @@ def test_equals_the_slow_loops(is_anisotropic: bool) -> None:
 
 
 def test_one_particle_by_hand() -> None:
-    """At the centre m over the cube of 1 + 2 (e^-1/8 + e^-4/8 + ... + e^-36/8); about m / ((2 pi)^1.5 s^3)."""
-    grid = voxelize(particles([[10.0, 10.0, 10.0]], 2.0, masses=np.array([5.0])), cube(21))["density"]
-    peak = 5.0 / (1 + 2 * sum(math.exp(-v * v / 8) for v in range(1, 7))) ** 3
-    assert peak == pytest.approx(5.0 / ((2 * math.pi) ** 1.5 * 2.0**3), rel=0.01)
-    assert grid[10, 10, 10] == pytest.approx(peak, rel=1e-6)
-    assert grid[12, 10, 10] == pytest.approx(peak * math.exp(-0.5), rel=1e-6)
+    """Drawn with 2.1 voxels; at the centre m over the cube of 1 + 2 (e^-1/8.82 + e^-4/8.82 + ... + e^-36/8.82)."""
+    scale = math.sqrt(2.1**2 + 1 / 6)
+    grid = voxelize(particles([[10.0, 10.0, 10.0]], scale, masses=np.array([5.0])), cube(21))["density"]
+    peak = 5.0 / (1 + 2 * sum(math.exp(-v * v / 8.82) for v in range(1, 7))) ** 3
+    assert peak == pytest.approx(5.0 / ((2 * math.pi) ** 1.5 * 2.1**3), rel=0.01)
+    assert grid[10, 10, 10] == pytest.approx(peak, rel=1e-5)
+    assert grid[12, 10, 10] == pytest.approx(peak * math.exp(-4 / 8.82), rel=1e-5)
     assert np.unravel_index(grid.argmax(), grid.shape) == (10, 10, 10)
 
 
@@ -118,20 +125,27 @@ def test_wide_particles_keep_their_mass_too() -> None:
         particles([[0.3, 0.0, 0.0]], 64.5, masses=np.ones(1)),
         Lattice(origin=(-200.0, 0.0, 0.0), voxel_size=1.0, shape=(401, 1, 1)),
     )
-    share = 1.0 / (math.sqrt(2 * math.pi) * 64.5 * math.erf(3 / math.sqrt(2))) ** 2  # of the one row through the centre
+    share = (
+        1.0 / (math.sqrt(2 * math.pi) * drawn_scale(64.5) * math.erf(3 / math.sqrt(2))) ** 2
+    )  # of the one row through the centre
     assert float(row["density"].sum(dtype=np.float64)) == pytest.approx(share, rel=1e-3)
     scales, turn = np.array([[9.0, 10.0, 12.0]]), np.array([[0.9, 0.1, -0.3, 0.2]], np.float32)
     grid = voxelize(particles([[40.3, 40.1, 39.8]], scales, masses=np.ones(1), rotations=turn), cube(81))["density"]
     assert float(grid.sum(dtype=np.float64)) == pytest.approx(1.0, rel=1e-3)
 
 
-def test_the_optical_depth_is_that_of_the_projected_gaussian() -> None:
-    """tau = m / (2 pi s^2) exp(-r^2 / 2 s^2), METHOD's pixel model, as a sum along z."""
-    frame = particles([[20.0, 20.0, 20.0]], 3.0, masses=np.array([50.0]))
-    found = voxelize(frame, cube(41))["density"].sum(axis=2)
-    x, y = np.meshgrid(np.arange(41) - 20.0, np.arange(41) - 20.0, indexing="ij")
-    expected = 50.0 / (2 * math.pi * 9.0) * np.exp(-(x**2 + y**2) / 18.0)
-    np.testing.assert_allclose(found, expected, atol=0.015 * expected.max())
+@pytest.mark.parametrize(("scale", "error"), [(0.8, 0.36), (1.25, 0.13), (3.0, 0.035)])
+def test_seen_through_linear_interpolation_it_is_the_projected_gaussian(scale: float, error: float) -> None:
+    """tau = m / (2 pi s^2) exp(-r^2 / 2 s^2), METHOD's pixel model, along rays through the interpolated grid."""
+    frame = particles([[20.2, 20.0, 19.7]], scale, masses=np.array([1.0]))
+    grid = voxelize(frame, cube(41))["density"].astype(np.float64)
+    fine = np.linspace(20.0 - 5 * scale, 20.0 + 5 * scale, 201)
+    x, y = np.meshgrid(fine, fine, indexing="ij")
+    found = map_coordinates(grid.sum(axis=2), [x, y], order=1)
+    expected = np.exp(-((x - 20.2) ** 2 + (y - 20.0) ** 2) / (2 * scale**2)) / (2 * math.pi * scale**2)
+    np.testing.assert_allclose(found, expected, atol=error * expected.max())
+    variance = float((found * (x - 20.2) ** 2).sum() / found.sum())
+    assert variance == pytest.approx(scale**2, rel=0.04)  # what lies beyond the cutoff is 2.7 % of it
 
 
 def test_equal_axes_do_not_care_about_rotation() -> None:
@@ -145,7 +159,9 @@ def test_a_rotation_turns_the_long_axis_where_it_says() -> None:
     quarter = np.array([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]])
     frame = particles([[15.0, 15.0, 15.0]], np.array([[4.0, 1.0, 1.0]]), rotations=quarter)
     grid = voxelize(frame, cube(31))["density"]
-    np.testing.assert_allclose(splat_extents(frame, 1.0), [[3.0, 12.0, 3.0]], atol=1e-6)
+    np.testing.assert_allclose(
+        splat_extents(frame, 1.0), [[3 * math.sqrt(5 / 6), 3 * math.sqrt(16 - 1 / 6), 3 * math.sqrt(5 / 6)]], atol=1e-6
+    )
     assert grid[15, 20, 15] > 100 * grid[20, 15, 15]
 
 
