@@ -13,6 +13,7 @@ from backend.fit.clean_plate import shortest_interval
 from backend.io.images import linear_to_srgb
 
 MIN_SKY_SHARE = 0.1  # of the picture; less is no sky to speak of
+_FIT_SIDE = 192  # px: a gradient needs no more
 _ROUNDS = 14
 _KNOTS = 24  # cubic spline pieces over the height of the picture
 _ACROSS = 2  # degree of the polynomial across: a sky changes with height, and little sideways
@@ -47,31 +48,45 @@ def fit_sky(image: np.ndarray) -> Sky | None:
     and each turn may reach a strip further down.
     """
     coded = linear_to_srgb(image).astype(np.float32)
-    smooth = cv2.GaussianBlur(coded, (0, 0), max(1.0, max(coded.shape) / 200.0))
     height, width = coded.shape[:2]
-    down, across = _bases(height, width)
+    scale = min(1.0, _FIT_SIDE / max(height, width))
+    small = (max(8, round(width * scale)), max(8, round(height * scale)))
+    smooth = cv2.GaussianBlur(cv2.resize(coded, small, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+    coefficients = _grow(smooth)
+    if coefficients is None:
+        return None
+    model = _gradient(height, width, coefficients)
+    blurred = cv2.GaussianBlur(coded, (0, 0), max(1.0, 1.0 / scale))
+    is_clear = _connected_with_top(np.abs(blurred - model).max(axis=2) < 2.0 * _TOLERANCE)
+    if is_clear.mean() < MIN_SKY_SHARE:
+        return None
+    residual = float(np.sqrt(np.mean((coded - model)[is_clear] ** 2)))
+    return Sky(coded=model, is_clear=is_clear, skyline=_skyline(coded, is_clear), residual=residual)
+
+
+def _grow(smooth: np.ndarray) -> np.ndarray | None:
+    """Spline coefficients of the gradient that the sky of an image [h, w, 3] coded follows; None where there is none."""
+    height, width = smooth.shape[:2]
     is_clear = np.zeros((height, width), bool)
     is_clear[: max(2, height // 8)] = True
     is_clear &= _is_smooth(smooth)
-    model = smooth
+    coefficients = np.zeros(0)
     for step in range(_ROUNDS):
         if is_clear.mean() < 0.02:
             return None
         lowest = int(np.flatnonzero(is_clear.any(axis=1)).max())
-        model = _fit(smooth, down, across, is_clear)
+        coefficients = _fit(smooth, is_clear)
         tolerance = _TOLERANCE * (2.0 if step < _ROUNDS - 2 else 1.5)
-        is_near = np.abs(smooth - model).max(axis=2) < tolerance
+        is_near = np.abs(smooth - _gradient(height, width, coefficients)).max(axis=2) < tolerance
         is_near &= np.arange(height)[:, None] < lowest + max(2, height // 20)
         is_clear = _connected_with_top(is_near)
     if is_clear.mean() < MIN_SKY_SHARE:
         return None
-    line = _skyline(coded, is_clear)
+    line = _skyline(smooth, is_clear)
     for _ in range(_BELT_ROUNDS):
-        is_clear = _with_haze_belt(smooth, model, is_clear, line)
-        model = _fit(smooth, down, across, is_clear)
-    line = _skyline(coded, is_clear)
-    residual = float(np.sqrt(np.mean((coded - model)[is_clear] ** 2)))
-    return Sky(coded=model, is_clear=is_clear, skyline=line, residual=residual)
+        is_clear = _with_haze_belt(smooth, _gradient(height, width, coefficients), is_clear, line)
+        coefficients = _fit(smooth, is_clear)
+    return coefficients
 
 
 def _with_haze_belt(smooth: np.ndarray, model: np.ndarray, is_clear: np.ndarray, line: np.ndarray) -> np.ndarray:
@@ -90,37 +105,43 @@ def _with_haze_belt(smooth: np.ndarray, model: np.ndarray, is_clear: np.ndarray,
     difference = np.where(is_belt[..., None], smooth - model, np.nan)
     length = max(4, round(_BELT_SHARE * width))
     centre, spread = shortest_interval(difference.transpose(1, 0, 2), length)
-    is_row = (spread.max(axis=1) < 2.0 * _TOLERANCE) & (np.abs(centre).max(axis=1) < _MAX_BELT)
-    is_near = np.abs(difference - centre[:, None, :]).max(axis=2) < _TOLERANCE
+    is_row = (spread.max(axis=1) < 4.0 * _TOLERANCE) & (np.abs(centre).max(axis=1) < _MAX_BELT)
+    is_near = np.abs(difference - centre[:, None, :]).max(axis=2) < 2.0 * _TOLERANCE
     return (is_clear & ~is_belt) | (is_near & is_row[:, None])
 
 
 def _bases(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cubic B-splines over the rows [h, K] and Chebyshev polynomials over the columns [w, 3]."""
+    """Cubic B-splines over the rows [h, K] and Chebyshev polynomials over the columns [w, A]."""
     knots = np.linspace(-3.0, _KNOTS + 3.0, _KNOTS + 7)
-    rows = np.linspace(0.0, _KNOTS * (1.0 - 1e-9), height)
+    rows = _KNOTS * (np.arange(height) + 0.5) / height
     down = BSpline.design_matrix(rows, knots, 3).toarray()
-    return down, np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, width), _ACROSS)
+    return down, np.polynomial.chebyshev.chebvander(2.0 * (np.arange(width) + 0.5) / width - 1.0, _ACROSS)
 
 
-def _fit(coded: np.ndarray, down: np.ndarray, across: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
-    """Penalised spline (Eilers & Marx 1996) through the clear pixels; [h, w, 3] coded.
+def _gradient(height: int, width: int, coefficients: np.ndarray) -> np.ndarray:
+    """The sky [h, w, 3] coded that coefficients [K, A, 3] stand for, at any size."""
+    down, across = _bases(height, width)
+    return np.einsum("hi,wa,iac->hwc", down, across, coefficients, optimize=True).astype(np.float32)
+
+
+def _fit(coded: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
+    """Penalised spline (Eilers & Marx 1996) through the clear pixels of [h, w, 3]; coefficients [K, A, 3].
 
     Second differences of the spline's coefficients are held small, so it goes on straight beyond the clear sky.
     """
+    down, across = _bases(*coded.shape[:2])
     weight = is_clear.astype(np.float64)
     num_down, num_across = down.shape[1], across.shape[1]
-    products = (across[:, :, None] * across[:, None, :]).reshape(len(across), -1)  # [w, a a]
-    moments = weight @ products  # [h, a a]
-    normal = np.einsum("hi,hj,hm->ijm", down, down, moments).reshape(num_down, num_down, num_across, num_across)
+    products = (across[:, :, None] * across[:, None, :]).reshape(len(across), -1)  # [w, A A]
+    moments = weight @ products  # [h, A A]
+    pairs = (down[:, :, None] * down[:, None, :]).reshape(len(down), -1)  # [h, K K]
+    normal = (pairs.T @ moments).reshape(num_down, num_down, num_across, num_across)
     normal = normal.transpose(0, 2, 1, 3).reshape(num_down * num_across, -1)
     right = np.einsum("hi,wa,hwc->iac", down, across, weight[..., None] * coded, optimize=True).reshape(len(normal), 3)
     bend = np.diff(np.eye(num_down), n=2, axis=0)
     stiffness = np.kron(bend.T @ bend, np.diag([1.0, 10.0, 100.0][:num_across]))
-    per_knot = weight.sum() / num_down
-    normal = normal + per_knot * (_STIFFNESS * stiffness + 1e-6 * np.eye(len(normal)))
-    coefficients = np.linalg.solve(normal, right).reshape(num_down, num_across, 3)
-    return np.einsum("hi,wa,iac->hwc", down, across, coefficients, optimize=True).astype(np.float32)
+    normal = normal + weight.sum() / num_down * (_STIFFNESS * stiffness + 1e-6 * np.eye(len(normal)))
+    return np.linalg.solve(normal, right).reshape(num_down, num_across, 3)
 
 
 def _is_smooth(coded: np.ndarray) -> np.ndarray:
