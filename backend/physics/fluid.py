@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from .colliders import Collider, Vector, deflect, push_out
 from .kernels import POLY6, SPIKY_SQUARED_GRADIENT
 from .neighbours import Neighbours, build_grid, find_neighbours
-from .projection import blend, confine, constrain, correct, curl
+from .projection import COINCIDENT, approach, blend, confine, constrain, correct, curl, part
 
 MAX_TRAVEL = 0.4  # smoothing lengths a substep
 MAX_SHIFT = 0.1  # smoothing lengths a projection
@@ -90,8 +90,8 @@ class FluidParameters:
             vector = np.asarray(getattr(self, name), np.float64)
             if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST):
                 raise ValueError(f"{name} = {getattr(self, name)!r} is no finite vector")
-        if self.solver_iterations < 0 or self.max_substeps < 1 or self.tensile_exponent < 1:
-            raise ValueError("solver_iterations, max_substeps and tensile_exponent start at 0, 1 and 1")
+        if self.solver_iterations < 0 or self.max_substeps < 1 or not 1 <= self.tensile_exponent <= 15:
+            raise ValueError("solver_iterations start at 0, max_substeps at 1; tensile_exponent is 1 to 15")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,8 +158,8 @@ def typical_spacing(
             hint="Ask for more particles or for frames that show more smoke.",
         )
     rank = min(21, len(distinct) - 1)
-    distances, _ = KDTree(distinct).query(distinct, k=[rank + 1])
-    return float(np.median(distances)) * (4.0 / 3.0 * math.pi / (rank + 1)) ** (1.0 / 3.0)
+    distances, _ = KDTree(distinct).query(distinct, k=rank + 1)
+    return float(np.median(distances[:, -1])) * (4.0 / 3.0 * math.pi / (rank + 1)) ** (1.0 / 3.0)
 
 
 def lattice_density(
@@ -179,7 +179,7 @@ def number_density(
 ) -> np.ndarray:  # [N] 1/m^3
     """Poly6 number density at each particle, its own share included."""
     solver = _Solver(np.asarray(positions, np.float64) / smoothing_length, np.arange(len(positions)), rest_density=1.0)
-    solver.constrain(np.zeros_like(solver.positions), is_first=True, pulls=False)
+    solver.constrain(pulls=False)
     return solver.densities / smoothing_length**3
 
 
@@ -266,6 +266,15 @@ def limited(
     return motion * factors[:, None], int(is_fast.sum())
 
 
+def caused_share(
+    rates: np.ndarray,  # [N] dC/dt per substep
+    excess: np.ndarray,  # [N] C
+) -> np.ndarray:  # [N] 0 .. 1
+    """The part of the over-density that this substep's motion has brought about; the rest was there before."""
+    rates = np.maximum(rates, 0.0)
+    return np.where(rates > 0.0, rates / np.maximum(excess, np.maximum(rates, 1e-300)), 0.0)
+
+
 def energy_share(
     motion: np.ndarray,  # [N, 3]
     impulses: np.ndarray,  # [N, 3]
@@ -302,21 +311,33 @@ class _Solver:
             self.list_builds += 1
         return self._lists.starts, self._lists.indices
 
-    def constrain(self, motion: np.ndarray, *, is_first: bool, pulls: bool) -> None:
-        """Densities, lambdas and, the first time, shares."""
+    def rates(self, motion: np.ndarray) -> np.ndarray:  # [N]
+        """How fast the motion compresses, per substep. Parts coincident particles first."""
+        rates, nearest = np.empty(len(motion)), np.empty(len(motion))
+        approach(self.positions, motion, *self.lists(), self.rest_density, rates, nearest)
+        if nearest.min(initial=1.0) < COINCIDENT**2:
+            parted = np.empty_like(self.positions)
+            part(self.positions, self.ids, *self.lists(), parted)
+            self.positions = parted
+            approach(self.positions, motion, *self.lists(), self.rest_density, rates, nearest)
+        return rates
+
+    def constrain(self, *, pulls: bool) -> None:
+        """Densities and lambdas."""
         epsilon = EPSILON_SHARE * self.squares_at_rest
         constrain(
-            self.positions, motion, self.ids, *self.lists(), self.rest_density, epsilon, pulls, is_first,
-            self.densities, self.lambdas, self.shares,
+            self.positions, *self.lists(), self.rest_density, epsilon, pulls, self.densities, self.lambdas
         )  # fmt: skip
 
     def correct(self, parameters: FluidParameters) -> None:
         """Shifts and impulses, none longer than MAX_SHIFT: first pair by pair, then, if need be, all alike."""
         tensile = parameters.tensile_strength / self.squares_at_rest
+        moving = self.lambdas * self.shares
         factors = np.ones(len(self.positions))
+        largest = 0.0
         for attempt in range(2):
             correct(
-                self.positions, self.ids, *self.lists(), self.rest_density, self.lambdas, self.shares, factors,
+                self.positions, *self.lists(), self.rest_density, self.lambdas, moving, factors,
                 tensile, parameters.tensile_exponent, self.shifts, self.impulses,
             )  # fmt: skip
             lengths = RELAXATION * np.sqrt(np.square(self.shifts).sum(axis=1))
@@ -333,10 +354,13 @@ class _Solver:
         length, colliders = parameters.smoothing_length, parameters.colliders
         self.positions = _pushed_out(self.positions + motion, colliders, length)
         total = np.zeros_like(motion)
+        rates = self.rates(motion)
         for iteration in range(parameters.solver_iterations):
-            self.constrain(motion, is_first=iteration == 0, pulls=parameters.pulls_when_sparse)
+            self.constrain(pulls=parameters.pulls_when_sparse)
             if iteration == 0:
-                self.overdensity = float(np.maximum(self.densities / self.rest_density - 1.0, 0.0).mean())
+                excess = self.densities / self.rest_density - 1.0
+                self.overdensity = float(np.maximum(excess, 0.0).mean())
+                self.shares = caused_share(rates, excess)
             self.correct(parameters)
             total += self.impulses
             self.positions = _pushed_out(self.positions + self.shifts, colliders, length)
@@ -350,8 +374,8 @@ class _Solver:
         """Viscosity and vorticity confinement, where wanted."""
         if parameters.viscosity == 0.0 and parameters.vorticity_confinement == 0.0:
             return motion
-        self.constrain(motion, is_first=False, pulls=False)
-        shared = (self.positions, motion, self.ids, *self.lists(), self.densities)
+        self.constrain(pulls=False)
+        shared = (self.positions, motion, *self.lists(), self.densities)
         if parameters.viscosity > 0.0:
             result = np.empty_like(motion)
             blend(*shared, -math.expm1(-parameters.viscosity * seconds), result)

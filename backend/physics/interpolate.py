@@ -16,7 +16,7 @@ from numba import njit, prange
 from scipy.spatial import KDTree
 
 from .fluid import FluidState
-from .neighbours import build_grid, cell_rows
+from .neighbours import MAX_RANGES, build_grid, candidate_ranges
 
 SPARSE = 0.05  # weight below which the nearest particles begin to have a say; 1: a particle in the very place
 _NEAREST = 8
@@ -28,13 +28,13 @@ def _average(points, cell_size, shape, starts, order, coordinates, values, smoot
     num, num_channels = points.shape[0], values.shape[1]
     scale = 1.0 / (smoothing_length * smoothing_length)
     for task in prange(num_tasks):
-        ranges = np.empty((27, 2), np.int64)
+        ranges = np.empty((MAX_RANGES, 2), np.int64)
         for i in range(task * num // num_tasks, (task + 1) * num // num_tasks):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             total = 0.0
             for c in range(num_channels):
                 sums[i, c] = 0.0
-            for row in range(cell_rows(x, y, z, cell_size, shape, starts, ranges)):
+            for row in range(candidate_ranges(x, y, z, smoothing_length, cell_size, shape, starts, ranges)):
                 for k in range(ranges[row, 0], ranges[row, 1]):
                     dx, dy, dz = coordinates[0, k] - x, coordinates[1, k] - y, coordinates[2, k] - z
                     share = 1.0 - (dx * dx + dy * dy + dz * dz) * scale

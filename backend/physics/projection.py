@@ -24,7 +24,12 @@ from numba import njit, prange
 
 from .kernels import POLY6, SPIKY_SLOPE, poly6
 
-COINCIDENT = 1e-6  # smoothing lengths; closer pairs are treated as this far apart, along a direction made from their ids
+COINCIDENT = 1e-6  # smoothing lengths; closer pairs are parted along a direction made from their ids
+
+# Sums may be reordered, so that loops over neighbours run in vector registers. The order is fixed when compiled: results
+# are the same for any number of threads, and differ between kinds of processor in the last digits.
+_SUMS = {"reassoc", "contract", "arcp", "nsz"}
+_SMALLEST_SQUARE = COINCIDENT * COINCIDENT  # h^2; under the root wherever a direction is needed
 
 
 @njit(cache=True, inline="always")
@@ -47,88 +52,117 @@ def separation(id_a, id_b):
     return sign * radius * math.cos(angle), sign * radius * math.sin(angle), sign * z
 
 
-@njit(cache=True, inline="always")
-def _offset(positions, ids, i, j):
-    """From j to i: vector and length [h]; coincident pairs are parted by COINCIDENT."""
-    dx = positions[i, 0] - positions[j, 0]
-    dy = positions[i, 1] - positions[j, 1]
-    dz = positions[i, 2] - positions[j, 2]
-    squared = dx * dx + dy * dy + dz * dz
-    if squared < COINCIDENT * COINCIDENT:
-        dx, dy, dz = separation(ids[i], ids[j])
-        dx, dy, dz, squared = COINCIDENT * dx, COINCIDENT * dy, COINCIDENT * dz, COINCIDENT * COINCIDENT
-    return dx, dy, dz, squared
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
-def constrain(positions, motion, ids, starts, indices, rest_density, epsilon, pulls, is_first, densities, lambdas, shares):
-    """Writes densities [N], lambdas [N] and, if is_first, shares [N]: the part of lambda that turns into velocity.
+def part(positions, ids, starts, indices, parted):
+    """Writes parted [N, 3]: positions with coincident pairs moved apart by 2 COINCIDENT, their centre kept."""
+    for i in prange(positions.shape[0]):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        for k in range(starts[i], starts[i + 1]):
+            j = indices[k]
+            dx, dy, dz = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1], positions[i, 2] - positions[j, 2]
+            if dx * dx + dy * dy + dz * dz < _SMALLEST_SQUARE:
+                dx, dy, dz = separation(ids[i], ids[j])
+                x, y, z = x + COINCIDENT * dx, y + COINCIDENT * dy, z + COINCIDENT * dz
+        parted[i, 0], parted[i, 1], parted[i, 2] = x, y, z
 
-    epsilon: added to the sum of squared gradients. pulls: under-dense particles attract. The share is
-    dt (dC/dt) / C with dC/dt from the motion, between 0 and 1.
+
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=_SUMS)
+def approach(positions, motion, starts, indices, rest_density, rates, nearest):
+    """rates [N]: dC/dt for the motion, per substep; nearest [N]: squared distance of the closest neighbour [h^2]."""
+    for i in prange(positions.shape[0]):
+        rate, closest = 0.0, 1.0
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        ux, uy, uz = motion[i, 0], motion[i, 1], motion[i, 2]
+        for k in range(starts[i], starts[i + 1]):
+            j = np.uint32(indices[k])
+            dx, dy, dz = x - positions[j, 0], y - positions[j, 1], z - positions[j, 2]
+            squared = dx * dx + dy * dy + dz * dz
+            closest = min(closest, squared)
+            near = max(1.0 - squared, 0.0)
+            rate -= near * near * (dx * (ux - motion[j, 0]) + dy * (uy - motion[j, 1]) + dz * (uz - motion[j, 2]))
+        rates[i] = 6.0 * POLY6 / rest_density * rate
+        nearest[i] = closest
+
+
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=_SUMS)
+def constrain(positions, starts, indices, rest_density, epsilon, pulls, densities, lambdas):
+    """Writes densities [N] 1/h^3 and lambdas [N] h^2 (eq. 11).
+
+    epsilon: added to the sum of squared gradients. pulls: under-dense particles attract.
     """
     scale = SPIKY_SLOPE / rest_density
     for i in prange(positions.shape[0]):
-        density, squares, rate = POLY6, 0.0, 0.0
-        gx, gy, gz = 0.0, 0.0, 0.0
+        total, squares, gx, gy, gz = 1.0, 0.0, 0.0, 0.0, 0.0
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         for k in range(starts[i], starts[i + 1]):
-            j = indices[k]
-            dx, dy, dz, squared = _offset(positions, ids, i, j)
-            if squared < 1.0:
-                distance = math.sqrt(squared)
-                near = 1.0 - squared
-                density += poly6(squared, 1.0)
-                slope = (1.0 - distance) * (1.0 - distance)
-                over = slope / distance
-                gx, gy, gz, squares = gx + over * dx, gy + over * dy, gz + over * dz, squares + slope * slope
-                if is_first:
-                    approach = (
-                        dx * (motion[i, 0] - motion[j, 0])
-                        + dy * (motion[i, 1] - motion[j, 1])
-                        + dz * (motion[i, 2] - motion[j, 2])
-                    )
-                    rate -= near * near * approach
+            j = np.uint32(indices[k])
+            dx, dy, dz = x - positions[j, 0], y - positions[j, 1], z - positions[j, 2]
+            squared = max(dx * dx + dy * dy + dz * dz, _SMALLEST_SQUARE)
+            near = max(1.0 - squared, 0.0)
+            total += near * near * near
+            inverse = 1.0 / math.sqrt(squared)
+            slope = max(1.0 - squared * inverse, 0.0)
+            slope *= slope
+            squares += slope * slope
+            over = slope * inverse
+            gx += over * dx
+            gy += over * dy
+            gz += over * dz
+        density = POLY6 * total
         constraint = density / rest_density - 1.0
-        if is_first:
-            rate = max(6.0 * POLY6 / rest_density * rate, 0.0)
-            shares[i] = 1.0 if rate >= constraint and rate > 0.0 else rate / max(constraint, 1e-300)
         densities[i] = density
         squared_gradients = scale * scale * (gx * gx + gy * gy + gz * gz + squares)
         lambdas[i] = -(constraint if pulls else max(constraint, 0.0)) / (squared_gradients + epsilon)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def correct(positions, ids, starts, indices, rest_density, lambdas, shares, factors, tensile, exponent, shifts, impulses):
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=_SUMS)
+def correct(positions, starts, indices, rest_density, lambdas, moving, factors, tensile, exponent, shifts, impulses):
     """Writes shifts [N, 3], the corrections (eq. 14), and impulses [N, 3], the part of them that turns into velocity.
 
-    factors [N]: limits of each particle, a pair takes the smaller. tensile: strength of the artificial pressure
-    (eq. 13, with distance 0.25 h), in units of lambda. It parts particles and never turns into velocity.
+    moving [N]: the part of lambdas that does. factors [N]: limit of each particle's shift, a pair takes the smaller.
+    tensile: strength of the artificial pressure (eq. 13, with distance 0.25 h) in units of lambda, exponent below 16;
+    it parts particles and never turns into velocity.
     """
     scale = SPIKY_SLOPE / rest_density
-    nearest = 1.0 / (1.0 - 0.25 * 0.25)
     for i in prange(positions.shape[0]):
         sx, sy, sz, px, py, pz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        own, moving, limit = lambdas[i], lambdas[i] * shares[i], factors[i]
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        own, own_moving, limit = lambdas[i], moving[i], factors[i]
         for k in range(starts[i], starts[i + 1]):
-            j = indices[k]
-            dx, dy, dz, squared = _offset(positions, ids, i, j)
-            if squared < 1.0:
-                distance = math.sqrt(squared)
-                over = -scale * (1.0 - distance) * (1.0 - distance) / distance * min(limit, factors[j])
-                pressure = own + lambdas[j]
-                impulse = over * (moving + lambdas[j] * shares[j])
-                if tensile > 0.0:
-                    share = (1.0 - squared) * nearest
-                    pressure -= tensile * (share * share * share) ** exponent
-                pressure *= over
-                sx, sy, sz = sx + pressure * dx, sy + pressure * dy, sz + pressure * dz
-                px, py, pz = px + impulse * dx, py + impulse * dy, pz + impulse * dz
+            j = np.uint32(indices[k])
+            dx, dy, dz = x - positions[j, 0], y - positions[j, 1], z - positions[j, 2]
+            squared = max(dx * dx + dy * dy + dz * dz, _SMALLEST_SQUARE)
+            inverse = 1.0 / math.sqrt(squared)
+            slope = max(1.0 - squared * inverse, 0.0)
+            over = -scale * slope * slope * inverse * min(limit, factors[j])
+            pressure = over * (own + lambdas[j] - tensile * _tensile_share(squared, exponent))
+            impulse = over * (own_moving + moving[j])
+            sx += pressure * dx
+            sy += pressure * dy
+            sz += pressure * dz
+            px += impulse * dx
+            py += impulse * dy
+            pz += impulse * dz
         shifts[i, 0], shifts[i, 1], shifts[i, 2] = sx, sy, sz
         impulses[i, 0], impulses[i, 1], impulses[i, 2] = px, py, pz
 
 
+@njit(cache=True, inline="always")
+def _tensile_share(squared, exponent):
+    """(W(r) / W(0.25 h))^exponent by the bits of the exponent: selects, not branches."""
+    base = max(1.0 - squared, 0.0) / (1.0 - 0.25 * 0.25)
+    one = base * base * base
+    two = one * one
+    four = two * two
+    power = one if exponent & 1 else 1.0
+    power *= two if exponent & 2 else 1.0
+    power *= four if exponent & 4 else 1.0
+    power *= four * four if exponent & 8 else 1.0
+    return power
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
-def blend(positions, motion, ids, starts, indices, densities, share, blended):
+def blend(positions, motion, starts, indices, densities, share, blended):
     """XSPH viscosity (Schechter & Bridson 2012; Macklin & Mueller 2013 eq. 17). Writes blended [N, 3].
 
     Divided by the larger density of a pair: what one gains the other loses, and with share at most 1 every new motion
@@ -138,7 +172,8 @@ def blend(positions, motion, ids, starts, indices, densities, share, blended):
         x, y, z = 0.0, 0.0, 0.0
         for k in range(starts[i], starts[i + 1]):
             j = indices[k]
-            _, _, _, squared = _offset(positions, ids, i, j)
+            dx, dy, dz = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1], positions[i, 2] - positions[j, 2]
+            squared = dx * dx + dy * dy + dz * dz
             if squared < 1.0:
                 weight = poly6(squared, 1.0) / max(densities[i], densities[j])
                 x += weight * (motion[j, 0] - motion[i, 0])
@@ -150,13 +185,14 @@ def blend(positions, motion, ids, starts, indices, densities, share, blended):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def curl(positions, motion, ids, starts, indices, densities, curls):
+def curl(positions, motion, starts, indices, densities, curls):
     """Vorticity sum_j (u_j - u_i) x grad_j W / rho (Macklin & Mueller 2013 eq. 15). Writes curls [N, 3]."""
     for i in prange(positions.shape[0]):
         x, y, z = 0.0, 0.0, 0.0
         for k in range(starts[i], starts[i + 1]):
             j = indices[k]
-            dx, dy, dz, squared = _offset(positions, ids, i, j)
+            dx, dy, dz = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1], positions[i, 2] - positions[j, 2]
+            squared = max(dx * dx + dy * dy + dz * dz, _SMALLEST_SQUARE)
             if squared < 1.0:
                 distance = math.sqrt(squared)
                 over = SPIKY_SLOPE * (1.0 - distance) * (1.0 - distance) / distance / densities[i]
@@ -167,7 +203,7 @@ def curl(positions, motion, ids, starts, indices, densities, curls):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def confine(positions, ids, starts, indices, densities, curls, pushes):
+def confine(positions, starts, indices, densities, curls, pushes):
     """Direction N x omega of vorticity confinement (Macklin & Mueller 2013 eq. 16). Writes pushes [N, 3].
 
     N = grad |omega| / |grad |omega||, with an epsilon under the root relative to |omega| per smoothing length.
@@ -177,7 +213,8 @@ def confine(positions, ids, starts, indices, densities, curls, pushes):
         x, y, z, largest = 0.0, 0.0, 0.0, own
         for k in range(starts[i], starts[i + 1]):
             j = indices[k]
-            dx, dy, dz, squared = _offset(positions, ids, i, j)
+            dx, dy, dz = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1], positions[i, 2] - positions[j, 2]
+            squared = max(dx * dx + dy * dy + dz * dz, _SMALLEST_SQUARE)
             if squared < 1.0:
                 distance = math.sqrt(squared)
                 other = math.sqrt(curls[j, 0] ** 2 + curls[j, 1] ** 2 + curls[j, 2] ** 2)
