@@ -28,6 +28,7 @@ def import_result(
     job = Path(job_folder).resolve()
     result = read_result(job)
     cameras = read_cameras(job / result.cameras)
+    volume.check_readable(job, result)
     target = collection or collection_of(job, scene)
     smoke = find_object(job, "volume") or volume.new_object(job, target)
     volume.show_sequence(smoke, job, result)

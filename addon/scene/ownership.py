@@ -35,7 +35,7 @@ def collection_of(job: Path, scene: bpy.types.Scene) -> bpy.types.Collection:
     if found is None:
         found = bpy.data.collections.new(owned_name(job, "Wildsmoke"))
         mark(found, job, "collection")
-    if found.name not in scene.collection.children_recursive:
+    if found not in scene.collection.children_recursive:
         scene.collection.children.link(found)
     return found
 

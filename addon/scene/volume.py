@@ -28,17 +28,27 @@ def new_object(job: Path, collection: bpy.types.Collection) -> bpy.types.Object:
     return smoke
 
 
+def check_readable(job: Path, result: Result) -> None:
+    """Whether Blender can read the job's first file, before anything is made. Raises BackendError."""
+    path = _first_file(job, result)
+    if not path.is_file():
+        raise BackendError("vdb_missing", f"There is no {path}.", hint="Run the job again; it writes what is missing.")
+    probe = bpy.data.volumes.new("wildsmoke probe")
+    try:
+        probe.filepath = str(path)
+        if not probe.grids.load():
+            raise BackendError("vdb_damaged", f"Blender cannot read {path}.", hint="Delete it and run the job again.")
+    finally:
+        bpy.data.volumes.remove(probe)
+
+
 def show_sequence(smoke: bpy.types.Object, job: Path, result: Result) -> None:
     """Point the volume at the job's sequence: on frame f it shows the file numbered f - frame_start."""
-    first_file = job / result.vdb_folder / VDB_NAME.format(1)
-    if not first_file.is_file():
-        raise BackendError("vdb_missing", f"There is no {first_file}.", hint="Run the job again; it writes what is missing.")
     data = smoke.data
-    data.filepath = str(first_file)
+    data.filepath = str(_first_file(job, result))
     data.is_sequence = False
-    if not data.grids.load():
-        raise BackendError("vdb_damaged", f"Blender cannot read {first_file}.", hint="Delete it and run the job again.")
-    data.velocity_grid = "velocity"  # looked up in the file, so the grids must be loaded
+    data.grids.load()
+    data.velocity_grid = "velocity"  # looked up among the grids, so they must be loaded
     data.grids.unload()
     data.is_sequence = True
     data.frame_start, last = frame_range(result)
@@ -51,6 +61,10 @@ def show_sequence(smoke: bpy.types.Object, job: Path, result: Result) -> None:
     align(smoke)
     data.render.space = "WORLD"
     data.render.step_size = result.voxel_size
+
+
+def _first_file(job: Path, result: Result) -> Path:
+    return job / result.vdb_folder / VDB_NAME.format(1)
 
 
 def align(smoke: bpy.types.Object) -> None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from backend.contract.errors import BackendError
 from backend.contract.job import ExportConfig
 from backend.contract.result import VDB_NAME
@@ -23,7 +22,7 @@ from backend.reporting import Report
 
 Vector = tuple[float, float, float]
 
-VOXELS_PER_SCALE = 1.25  # a Gaussian sampled at 1.25 points a standard deviation and interpolated linearly errs by 2 %
+VOXELS_PER_SCALE = 1.25  # a plume seen through the grid differs in opacity by 0.48 % at 1, 0.36 % here, 0.32 % at 2
 COLOR_THRESHOLD = 0.04  # weighted standard deviation of a linear colour channel, relative to the brightest mean channel
 
 _TRIM = 5e-4  # share of the optical mass on either side of an axis that may be left out where it would coarsen all the rest
