@@ -21,6 +21,7 @@ from . import projection
 from .binning import Bins, bin_splats
 from .composite import composite, composite_backward
 from .gaussians import Gaussians, require_finite
+from .projection_gradient import Found, project_backward
 from .pyramid import Pyramid, make_pyramid, max_levels, upsample, upsample_adjoint
 from .splat_kernels import NUM_SUMS, copy_rows, differentiate, draw, gather, largest_magnitude, scaled_into, weigh
 
@@ -33,9 +34,7 @@ FAINTEST = 1e-20  # amplitudes (optical depth) and relative gradients below this
 class Geometry:
     """Everything that depends on positions, scales, rotations and view, but not on masses or features."""
 
-    near: float  # m
-    rotation: np.ndarray  # [3, 3] world to camera
-    camera: np.ndarray  # [9] fx, fy, cx, cy, width, height, position
+    lens: projection.Lens
     splats: np.ndarray  # [N, SPLAT_FIELDS]
     levels: np.ndarray  # [N] -1: not visible
     boxes: np.ndarray  # [N, 4] cells that a splat may touch: first and last row, first and last column
@@ -98,24 +97,25 @@ def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
     gather(slots, bins.slot_starts, geometry.num_chunks, sums)
     sums *= scale
     amplitudes = splat.optical_masses * geometry.splats[:, 5] * geometry.splats[:, 6]
-    camera = np.zeros((geometry.num_chunks, 6))
-    result = Gradients(
+    found = Found(
         positions=np.zeros((num, 3)),
         scales=np.zeros((num, 3)),
         rotations=np.zeros((num, 4)),
         optical_masses=np.zeros(num),
-        features=amplitudes[:, None] * sums[:, NUM_SUMS:],
-        camera_translation=np.zeros(3),
-        camera_rotation=np.zeros(3),
+        camera=np.zeros((geometry.num_chunks, 6)),
     )
-    projection.project_backward(
-        *_inputs(splat.gaussians), splat.optical_masses, geometry.rotation, geometry.camera, geometry.near,
-        geometry.num_chunks, geometry.splats, geometry.levels, sums, result.positions, result.scales, result.rotations,
-        result.optical_masses, camera,
-    )  # fmt: skip
-    result.camera_translation[:] = camera.sum(axis=0)[:3]
-    result.camera_rotation[:] = camera.sum(axis=0)[3:]
-    return result
+    inputs = (*_inputs(splat.gaussians), splat.optical_masses, geometry.lens, geometry.num_chunks)
+    project_backward(*inputs, geometry.splats, geometry.levels, sums, found)
+    camera = found.camera.sum(axis=0)
+    return Gradients(
+        positions=found.positions,
+        scales=found.scales,
+        rotations=found.rotations,
+        optical_masses=found.optical_masses,
+        features=amplitudes[:, None] * sums[:, NUM_SUMS:],
+        camera_translation=camera[:3],
+        camera_rotation=camera[3:],
+    )
 
 
 def adjoint_mass(splat: Splat, image_grad: np.ndarray) -> np.ndarray:
@@ -149,21 +149,16 @@ def _inputs(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _geometry(gaussians: Gaussians, view: View, near: float) -> Geometry:
     num = len(gaussians)
-    rotation = np.ascontiguousarray(view.rotation_world_to_camera, np.float64)
-    camera = np.array([view.fx, view.fy, view.cx, view.cy, view.width, view.height, *view.position], np.float64)
+    lens = projection.make_lens(view, near)
     splats = np.empty((num, projection.SPLAT_FIELDS))
     levels = np.empty(num, np.int64)
     boxes = np.empty((num, 4), np.int64)
     num_chunks = max(1, min(64, num // 256))
-    projection.project(
-        *_inputs(gaussians), rotation, camera, near, max_levels(view.width, view.height), num_chunks, splats, levels, boxes
-    )
+    projection.project(*_inputs(gaussians), lens, max_levels(view.width, view.height), num_chunks, splats, levels, boxes)
     pyramid = make_pyramid(view.width, view.height, 1 + max(0, int(levels.max(initial=0))))
     bins = bin_splats(pyramid, levels, boxes)
     return Geometry(
-        near=near,
-        rotation=rotation,
-        camera=camera,
+        lens=lens,
         splats=splats,
         levels=levels,
         boxes=boxes,
