@@ -23,6 +23,7 @@ class DepthPrior:
 
     half_thickness: np.ndarray  # [H, W] m, half the chord of the solid; positive where there is smoke
     center_depth: np.ndarray  # [H, W] m along the optical axis
+    is_smoke: np.ndarray  # [H, W] bool, the silhouette
 
 
 def inflate(optical_depth: np.ndarray, view: View, anchor: np.ndarray) -> DepthPrior:
@@ -34,13 +35,17 @@ def inflate(optical_depth: np.ndarray, view: View, anchor: np.ndarray) -> DepthP
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = cv2.resize(optical_depth.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    mask = small > MASK_SHARE * max(float(np.percentile(small, 99.5)), 1e-6)
-    chord = _ball_union(mask)
+    threshold = MASK_SHARE * max(float(np.percentile(small, 99.5)), 1e-6)
+    chord = _ball_union(small > threshold)
     chord = cv2.GaussianBlur(chord, (0, 0), 1.5)  # the union of balls has creases, smoke has none
     full = cv2.resize(chord, (width, height), interpolation=cv2.INTER_LINEAR)
     center = plane_depth(view, anchor)
     metres_per_pixel = center / (0.5 * (view.fx + view.fy)) / scale
-    return DepthPrior(half_thickness=np.maximum(full, 0.5) * metres_per_pixel, center_depth=center)
+    return DepthPrior(
+        half_thickness=np.maximum(full, 0.5) * metres_per_pixel,
+        center_depth=center,
+        is_smoke=optical_depth > threshold,
+    )
 
 
 def plane_depth(view: View, anchor: np.ndarray) -> np.ndarray:
@@ -93,8 +98,9 @@ def sample_points(
     view: View,
     *,
     seed: int,
+    is_even: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`count` points spread evenly over a weight image and over the prior's depth.
+    """`count` points spread over a weight image and over the prior's depth, by its profile or evenly.
 
     Returns world positions [count, 3] m and the pixel each came from [count, 2]. Systematic sampling along a
     serpentine scan keeps neighbours apart; depth takes a golden-ratio sequence through the profile's quantiles.
@@ -113,9 +119,31 @@ def sample_points(
     rows, columns = chosen // width, chosen % width
     pixels = np.stack([columns + random.random(count), rows + random.random(count)], axis=1)
     quantile = (random.random() + np.arange(count) * 0.6180339887498949) % 1.0
-    offset = _profile_quantile(random.permutation(quantile)) * prior.half_thickness[rows, columns]
+    shuffled = random.permutation(quantile)
+    share = 2.0 * shuffled - 1.0 if is_even else _profile_quantile(shuffled)
+    offset = share * prior.half_thickness[rows, columns]
     center = prior.center_depth[rows, columns]
     return view.unproject(pixels, np.maximum(center + offset, 1e-2 * center)), pixels
+
+
+def contain(
+    positions: np.ndarray,  # [N, 3] m
+    prior: DepthPrior,
+    view: View,
+    *,
+    share: float,
+) -> np.ndarray:
+    """Positions with a share of what they stand out of the prior's solid, in depth, taken back.
+
+    Sideways the image says where smoke is; in depth only the prior does, and pressure would drive it out there.
+    """
+    pixels, depth = view.project(positions)
+    columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
+    rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
+    offset = depth - prior.center_depth[rows, columns]
+    excess = np.sign(offset) * np.maximum(np.abs(offset) - prior.half_thickness[rows, columns], 0.0)
+    wanted = np.where(depth > 0, depth - share * excess, depth)
+    return np.where((depth > 0)[:, None], view.unproject(pixels, wanted), positions)
 
 
 _S = np.linspace(-1.0, 1.0, 513)

@@ -19,6 +19,7 @@ from backend.io.images import LUMINANCE, linear_to_srgb
 _LOW_NOISES = 3.0  # opacity below this many deviations of noise is none
 _MIN_LOW = 0.03  # opacity: errors of the plate that no noise figure knows
 _HIGH = 0.15  # opacity that a region must reach somewhere
+_MIN_REGION = 3e-4  # of the picture; smaller regions are specks
 _MIN_EXPLAINED = 0.55  # of the change over time in a neighbourhood: trees and cars brighten and darken at random
 _MIN_DWELL = 0.12  # mean opacity over time that a region must reach somewhere: a car passes, a plume stays
 _REACH = 0.03  # of the longest side: smoke may be this far from where the samples showed it
@@ -57,7 +58,7 @@ class Matte:
         allowed = is_known if self.region is None else is_known & self.background.placed(self.region, index)
         opacity = _opacity(image, color, allowed, self.smoke, self.background.noise, self.radius, kept=self.masks.kept)
         light = np.maximum(image - (1.0 - opacity[..., None]) * color, 0.0) * (opacity[..., None] > 0.0)
-        return np.concatenate([light, opacity[..., None]], axis=2)
+        return np.concatenate([self.smoke.limited(light), opacity[..., None]], axis=2)
 
 
 def prepare(
@@ -106,7 +107,8 @@ def _opacity(
     value = matting.guided_filter(raw, guide, radius=radius, epsilon=_GUIDE_EPSILON)
     value = np.where(allowed, value, 0.0)
     low = np.maximum(_LOW_NOISES * np.minimum(found.deviation, 0.2) / np.sqrt(2.0 * radius + 1.0), _MIN_LOW)
-    keep = matting.hysteresis(value, low=low, high=_HIGH)
+    min_pixels = max(9, round(_MIN_REGION * value.size))
+    keep = matting.hysteresis(value, low=low, high=_HIGH, min_pixels=min_pixels, explained=found.explained)
     if kept is not None:
         keep = np.where(kept, 1.0, keep)
     return (value * keep).astype(np.float32)

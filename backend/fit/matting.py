@@ -18,19 +18,33 @@ _OPACITY_SPREAD = 1.0  # prior deviation of opacity around 0: holds it down wher
 _MOVING_NOISE = 5.0 / 255  # sRGB code: video codecs spend few bits on what moves, above all on its colour
 _ROUNDS = 3  # the spread of the brightness term depends on the opacity itself
 _MIN_COLOR_PIXELS = 64
+_TINT_SLACK = 1.1
+_DARKEST = 0.4  # of the brightness: no side of the smoke is darker
+_MIN_SPREAD = 0.25  # of the brightness: the densest pixels are the lit ones, the shaded side is darker
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmokeColor:
-    """direction: [3] linear, luminance 1. brightness, spread: of the luminance of opaque smoke."""
+    """direction: [3] linear, luminance 1. brightness, spread: of the luminance of opaque smoke.
+
+    tint_range: factor by which a channel of dense smoke departs from the direction, either way.
+    """
 
     direction: np.ndarray
     brightness: float
     spread: float
+    tint_range: float = 1.5
 
     @property
     def linear(self) -> np.ndarray:  # [3]
         return (self.brightness * self.direction).astype(np.float32)
+
+
+    def limited(self, light: np.ndarray) -> np.ndarray:
+        """Light of smoke [h, w, 3] with its tint held to what dense smoke shows; its luminance stays."""
+        luminance = (light @ LUMINANCE)[..., None]
+        tint = np.clip(light, luminance * self.direction / self.tint_range, luminance * self.direction * self.tint_range)
+        return tint * (luminance / np.maximum((tint @ LUMINANCE)[..., None], 1e-9))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +74,7 @@ def solve_opacity(
     """Least squares over channels for opacity a and smoke light u = s a:
 
     sum_k ((a J_k - u c_k - (J_k - I_k)) / noise_k)^2 + ((u - brightness a) / (spread a))^2 + (a / opacity spread)^2.
+    Where that asks for smoke darker than its shaded side may be, brightness is held there and opacity solved alone.
     For spread -> 0 this is a = (J - I).(J - S) / |J - S|^2, the transmittance formula of METHOD solved for opacity.
     """
     weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), max(noise, _MOVING_NOISE)) ** 2
@@ -80,6 +95,12 @@ def solve_opacity(
         determinant = np.maximum(a11 * a22 - a12 * a12, 1e-12)
         opacity = np.clip((jd * a22 + cd * a12) / determinant, 0.0, 1.0)
         light = np.maximum((s * pull * opacity + jc * opacity - cd) / a22, 0.0)
+    darkest = np.float32(_DARKEST * s)
+    is_too_dark = light < darkest * opacity
+    contrast = jj - 2.0 * darkest * jc + darkest * darkest * cc
+    opaque = np.clip((jd - darkest * cd) / np.maximum(contrast, 1e-9), 0.0, 1.0)
+    opacity = np.where(is_too_dark & (contrast > prior), opaque, opacity)
+    light = np.where(is_too_dark, darkest * opacity, light)
     residual = (weight * (opacity[..., None] * background - light[..., None] * direction - difference) ** 2).sum(axis=2)
     total = (weight * difference * difference).sum(axis=2)
     explained = np.clip(1.0 - residual / np.maximum(total, 3.0), 0.0, 1.0)
@@ -111,12 +132,18 @@ def hysteresis(
     low: np.ndarray | float,  # below it nothing is kept; a soft ramp up to twice it
     high: float,  # a connected region must reach it
     min_pixels: int = 9,
+    explained: np.ndarray | None = None,  # [h, w] 0..1, of which a region must have `min_explained` in the mean
+    min_explained: float = 0.6,
 ) -> np.ndarray:
-    """[h, w] 0..1: what to keep of an opacity. Regions that stay below `high`, or are specks, go."""
+    """[h, w] 0..1: what to keep of an opacity. Regions that stay below `high`, are specks or unlike smoke, go."""
     num, labels = components(opacity > low)
     reaches = np.zeros(num, np.int64)
     np.add.at(reaches, labels[opacity > high], 1)
     is_kept = (reaches >= max(1, min_pixels // 3)) & (np.bincount(labels.ravel(), minlength=num) >= min_pixels)
+    if explained is not None:
+        mass = np.bincount(labels.ravel(), weights=opacity.ravel(), minlength=num)
+        share = np.bincount(labels.ravel(), weights=(opacity * explained).ravel(), minlength=num)
+        is_kept &= share >= min_explained * mass
     is_kept[0] = False
     ramp = np.clip(opacity / np.maximum(low, 1e-6) - 1.0, 0.0, 1.0)
     return np.where(is_kept[labels], ramp, 0.0).astype(np.float32)
@@ -150,8 +177,11 @@ def estimate_smoke_color(
     spread = float(np.percentile(luminance, 84) - np.percentile(luminance, 16)) / 2.0
     if brightness < 1e-4:
         return SmokeColor(direction=np.ones(3, np.float32), brightness=1e-4, spread=1e-2)
+    direction = (direction / float(direction @ LUMINANCE)).astype(np.float32)
+    tints = np.abs(np.log(np.maximum(dense, 1e-4) / np.maximum(luminance, 1e-4)[:, None] / direction))
     return SmokeColor(
-        direction=(direction / float(direction @ LUMINANCE)).astype(np.float32),
+        direction=direction,
         brightness=brightness,
-        spread=max(spread, 0.05 * brightness),
+        spread=max(spread, _MIN_SPREAD * brightness),
+        tint_range=float(np.exp(np.percentile(tints, 90))) * _TINT_SLACK,
     )

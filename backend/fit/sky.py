@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.ndimage import convolve1d
+from scipy.ndimage import convolve1d, grey_opening
 
 from backend.fit.clean_plate import shortest_interval
 from backend.io.images import linear_to_srgb
@@ -61,7 +61,7 @@ def fit_sky(image: np.ndarray) -> Sky | None:
     if is_clear.mean() < MIN_SKY_SHARE:
         return None
     residual = float(np.sqrt(np.mean((coded - model)[is_clear] ** 2)))
-    return Sky(coded=model, is_clear=is_clear, skyline=_skyline(coded, is_clear), residual=residual)
+    return Sky(coded=model, is_clear=is_clear, skyline=_without_dents(_skyline(coded, is_clear)), residual=residual)
 
 
 def _grow(smooth: np.ndarray) -> np.ndarray | None:
@@ -202,6 +202,11 @@ def _ground_likeness(coded: np.ndarray, is_clear: np.ndarray) -> np.ndarray:
     ground = histogram(flat[ground_from:])
     sky = histogram(flat[: max(2, int(0.9 * lowest))])
     return cv2.GaussianBlur((ground / (ground + sky))[flat].astype(np.float32), (0, 0), 0.7)
+
+
+def _without_dents(line: np.ndarray) -> np.ndarray:
+    """[w] the skyline without dips narrower than a sixteenth of the width: bright fields below the horizon make such."""
+    return grey_opening(line, size=2 * (len(line) // 32) + 1, mode="nearest")
 
 
 def _cheapest_path(cost: np.ndarray) -> np.ndarray:

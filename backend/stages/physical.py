@@ -30,6 +30,8 @@ from backend.reporting import Report
 SPLAT_SHARE = 0.5  # standard deviation of a physical particle's splat, share of the smoothing length
 DEATH_SHARE = 0.15  # of a particle's own share of the smoke: below it a particle is spent
 FADING = 0.7  # consistency of masses from frame to frame
+REST_QUANTILE = 0.95  # of the density of evenly sampled particles
+CONTAINMENT = 0.3  # share of what stands out of the prior's solid that is taken back a frame
 BUOYANCY_RIDGE = 20.0  # observations at which the learned buoyancy has half its say
 
 
@@ -66,10 +68,14 @@ class _Fit:
         self.unit_mass = max(masses[self.fullest], 1e-30) / config.num_particles
         view, tau = scene.views[self.fullest], optical_depth(layers[self.fullest])
         prior = depth_prior.inflate(tau, view, scene.anchor)
-        points, _ = depth_prior.sample_points(tau, config.num_particles, prior, view, seed=seed)
-        self.parameters = fluids.derive_parameters(
+        solid = prior.half_thickness * prior.is_smoke
+        points, _ = depth_prior.sample_points(solid, config.num_particles, prior, view, seed=seed, is_even=True)
+        parameters = fluids.derive_parameters(
             points, drag=config.drag, solver_iterations=config.solver_iterations, max_substeps=config.max_substeps
         )
+        # Random points are denser here and sparser there; only what is denser than they were is pressed apart.
+        densest = float(np.quantile(fluids.number_density(points, parameters.smoothing_length), REST_QUANTILE))
+        self.parameters = replace(parameters, rest_density=max(parameters.rest_density, densest))
         self.sigma = SPLAT_SHARE * self.parameters.smoothing_length
 
     def start(self) -> PhysicalRecord:
@@ -107,12 +113,16 @@ class _Fit:
         lack = _sideways(record.positions + wanted - predicted, self.scene.views[frame])
         positions = predicted + self._smooth(gain * lack, record)
         moved = self._corrected(replace(record, positions=positions), frame)
+        moved = depth_prior.contain(moved, self._prior(frame), self.scene.views[frame], share=CONTAINMENT)
         velocities = (moved - record.positions) / dt
         learned = self._learn_buoyancy(record, velocities, confidence)
         current = replace(learned, positions=moved, velocities=velocities)
         return self._births(self._weighed(current, frame), frame)
 
     # -- parts of a step ------------------------------------------------------------------------------------------
+
+    def _prior(self, frame: int) -> depth_prior.DepthPrior:
+        return depth_prior.inflate(optical_depth(self.layers[frame]), self.scene.views[frame], self.scene.anchor)
 
     def _observed(self, positions: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement [N, 3] m that the image asks for from `frame` to the next, and its confidence [N]."""
@@ -166,9 +176,10 @@ class _Fit:
         splat, target = self._splat(record, frame)
         missing = explain.missing_depth(splat, target)
         missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
-        prior = depth_prior.inflate(optical_depth(self.layers[frame]), view, self.scene.anchor)
+        prior = self._prior(frame)
         count = int((missing * pixel_mass(view, prior.center_depth)).sum() / self.unit_mass)
-        points, _ = depth_prior.sample_points(missing, count, prior, view, seed=self.seed + 7919 * frame)
+        weight = missing if len(record.positions) else prior.half_thickness * (prior.is_smoke & (missing > 0.0))
+        points, _ = depth_prior.sample_points(weight, count, prior, view, seed=self.seed + 7919 * frame, is_even=True)
         if len(points) == 0:
             return record
         velocities = np.zeros_like(points)
