@@ -28,7 +28,7 @@ MAX_TRAVEL = 0.4  # smoothing lengths a substep
 MAX_SHIFT = 0.1  # smoothing lengths a projection
 SKIN = 0.1  # smoothing lengths by which neighbour lists reach further, so that they last
 EPSILON_SHARE = 0.1  # of the sum of squared gradients at rest density, in lambda's denominator
-RELAXATION = 0.5  # of each correction: all particles correct at once and would overshoot
+RELAXATION = 0.75  # of each correction: all particles correct at once and would overshoot
 SPACINGS_PER_LENGTH = 2.2  # smoothing length over particle spacing
 _LARGEST = 1e60  # m, m/s, 1/s: squares and products of what is smaller are finite
 
