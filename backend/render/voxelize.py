@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+
 from backend.io.particles import ParticleFrame
 
 CUTOFF = 3.0  # standard deviations; what lies beyond (0.8 % of a Gaussian) is shared out within

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from backend.contract.errors import BackendError
 from backend.contract.job import ExportConfig
 from backend.contract.result import VDB_NAME
