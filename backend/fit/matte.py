@@ -129,7 +129,8 @@ def _region(images: list[np.ndarray], numbers: list[int], matte: Matte) -> np.nd
     for image, index in zip(images, numbers, strict=True):
         color, is_known = matte.background.at(index)
         found = matting.solve_opacity(image, color, matte.smoke, matte.background.noise)
-        difference = ((linear_to_srgb(image) - linear_to_srgb(color)) ** 2).sum(axis=2).astype(np.float32)
+        change = linear_to_srgb(image) - linear_to_srgb(color)
+        difference = np.einsum("hwc,hwc->hw", change, change).astype(np.float32)
         signal = np.maximum(difference - 9.0 * matte.background.noise**2, 0.0) * is_known
         back = [matte.background.unplaced(x.astype(np.float32), index) for x in (found.value * is_known, signal)]
         best = matte.background.unplaced((signal * found.explained).astype(np.float32), index)

@@ -80,11 +80,9 @@ def solve_opacity(
     weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), max(noise, _MOVING_NOISE)) ** 2
     difference = background - image
     direction = smoke.direction.astype(np.float32)
-    jj = (weight * background * background).sum(axis=2)
-    jc = (weight * background * direction).sum(axis=2)
-    cc = (weight * direction * direction).sum(axis=2)
-    jd = (weight * background * difference).sum(axis=2)
-    cd = (weight * direction * difference).sum(axis=2)
+    weighted = weight * background
+    jj, jc, jd = _dot(weighted, background), weighted @ direction, _dot(weighted, difference)
+    cc, cd = weight @ (direction * direction), (weight * difference) @ direction
     opacity = np.full(image.shape[:2], 0.5, np.float32)
     s, prior = np.float32(smoke.brightness), np.float32(1.0 / _OPACITY_SPREAD**2)
     light = s * opacity
@@ -101,12 +99,17 @@ def solve_opacity(
     opaque = np.clip((jd - darkest * cd) / np.maximum(contrast, 1e-9), 0.0, 1.0)
     opacity = np.where(is_too_dark & (contrast > prior), opaque, opacity)
     light = np.where(is_too_dark, darkest * opacity, light)
-    residual = (weight * (opacity[..., None] * background - light[..., None] * direction - difference) ** 2).sum(axis=2)
-    total = (weight * difference * difference).sum(axis=2)
+    rest = opacity[..., None] * background - light[..., None] * direction - difference
+    residual, total = _dot(weight * rest, rest), _dot(weight * difference, difference)
     explained = np.clip(1.0 - residual / np.maximum(total, 3.0), 0.0, 1.0)
     # The element a a of the inverse of the normal matrix, at the noise of the background: that is where it is needed.
     deviation = np.sqrt(a22 / determinant) * (noise / max(noise, _MOVING_NOISE))
     return Opacity(value=opacity, deviation=deviation.astype(np.float32), explained=explained.astype(np.float32))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[h, w]: sum over the channels; much faster than .sum(axis=2)."""
+    return np.einsum("hwc,hwc->hw", a, b)
 
 
 def guided_filter(value: np.ndarray, guide: np.ndarray, *, radius: int, epsilon: float) -> np.ndarray:
@@ -163,7 +166,7 @@ def estimate_smoke_color(
     colors, strengths = [], []
     for image, background, candidate in zip(images, backgrounds, candidates, strict=True):
         scaled = (image - background) / coded_noise_to_linear(np.maximum(image, background), noise)
-        strength = np.sqrt((scaled**2).sum(axis=2))
+        strength = np.sqrt(_dot(scaled, scaled))
         is_strong = candidate & (strength > 8.0)
         colors.append(image[is_strong])
         strengths.append(strength[is_strong])

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from fractions import Fraction
 from pathlib import Path
 from typing import cast
 
@@ -50,13 +51,14 @@ class VideoFile:
             stream = container.streams.video[0]
             self._may_have_alpha = _declares_alpha(stream)
             declared = stream.frames if "mov" in container.format.name else 0
+            self._time_base = stream.time_base or Fraction(1)
             average = float(stream.average_rate or 0.0)
             duration = 0.0 if container.duration is None else container.duration / av.time_base
             has_trusted_duration = "matroska" in container.format.name
         scan = self._scan()
         if has_trusted_duration and scan.fps > 0:
             declared = round(duration * scan.fps)
-            is_cut = scan.num_frames < 0.95 * declared - 2  # the last frame's own duration is not always counted
+            is_cut = scan.num_frames < 0.8 * declared - 5  # writers round up, by some frames
         elif scan.num_frames < declared:
             is_cut = True
         if is_cut:
@@ -93,6 +95,8 @@ class VideoFile:
                 return
             if index < start:
                 continue
+            if frame.is_corrupt:
+                raise self._damage_error(index)
             image = _upright(frame, has_alpha=self.has_alpha)
             if image.shape[:2] != (self.height, self.width):
                 raise BackendError(
@@ -102,11 +106,7 @@ class VideoFile:
                 )
             yield image
         if index + 1 < stop:
-            raise BackendError(
-                "clip_damaged",
-                f"{self.name} cannot be decoded beyond frame {index}; it should have {self.num_frames} frames.",
-                hint=f"Export the clip again, or use the frames before the damage with --frames 0:{index + 1}.",
-            )
+            raise self._damage_error(index + 1)
 
     def close(self) -> None:
         """Nothing is held open between passes."""
@@ -154,7 +154,7 @@ class VideoFile:
                 return _Scan(num_frames=len(times), fps=_mean_rate(times), has_alpha=False)
         times, has_alpha = [], False
         for frame in self._decoded():
-            times.append(frame.time)
+            times.append(None if frame.pts is None else float(frame.pts * self._time_base))
             if self._may_have_alpha and not has_alpha:
                 image = _upright(frame, has_alpha=True)
                 has_alpha = bool(image[..., 3].min() < np.iinfo(image.dtype).max)
@@ -167,6 +167,13 @@ class VideoFile:
             "clip_truncated",
             f"{self.name} ends early: {readable}{of_all} frames can be read.",
             hint="Copy or export it again; to go on with what is there, save it as a new file with a video editor.",
+        )
+
+    def _damage_error(self, index: int) -> BackendError:
+        return BackendError(
+            "clip_damaged",
+            f"{self.name} cannot be decoded beyond frame {index - 1}; it should have {self.num_frames} frames.",
+            hint=f"Export the clip again, or use the frames before the damage with --frames 0:{index}.",
         )
 
     def _unreadable(self, problem: str) -> BackendError:
