@@ -107,7 +107,7 @@ def set_up_commands(root: Path, *, python: str, home: Path, platform: str = sys.
         [str(_python_inside(folder, platform)), "-m", "pip", "install", "-r", str(requirements)],
     )
     if platform == "win32":
-        return tuple(" ".join(part if part.startswith("-") else f'"{part}"' for part in words) for words in commands)
+        return tuple(subprocess.list2cmdline(words) for words in commands)
     return tuple(shlex.join(words) for words in commands)
 
 

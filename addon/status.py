@@ -10,6 +10,15 @@ from ..backend.contract import events
 from .job_runner import NOISE_PREFIX, RunState
 from .job_state import JobKind, JobState
 
+STAGE_LABELS = {
+    "frames": "Reading the clip",
+    "smoke": "Finding the smoke",
+    "cameras": "Placing the camera",
+    "physical": "Fitting the motion",
+    "visual": "Fitting the look",
+    "forecast": "Forecasting",
+    "export": "Writing the volume",
+}
 MAX_SECONDS = 1e7  # nobody waits longer; also keeps absurd numbers out of the arithmetic
 
 
@@ -160,7 +169,8 @@ _HEADLINES = {
 def headline(status: JobStatus) -> str:
     """A few words on where the job stands."""
     if status.phase is Phase.RUNNING and status.stage:
-        return f"{status.stage.capitalize()} ({status.stage_index + 1} of {status.stage_count})"
+        label = STAGE_LABELS.get(status.stage, status.stage.replace("_", " ").capitalize())
+        return f"{label} ({status.stage_index + 1} of {status.stage_count})"
     return _HEADLINES[status.phase]
 
 

@@ -66,7 +66,7 @@ def read_result(job_folder: str | os.PathLike[str]) -> Result:
         for name in ("bounds", "smoke_color", "buoyancy"):
             data[name] = _tuples(data[name])
         return Result(**data)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise BackendError("result_unreadable", f"{path} cannot be read: {error}.", hint="Run the job again.") from error
 
 

@@ -67,9 +67,9 @@ def running_pid(job_folder: str | os.PathLike[str]) -> int | None:
     try:
         data = json.loads((Path(job_folder) / RUNNING_FILE).read_text(encoding="utf-8"))
         pid, start = int(data["pid"]), data.get("start")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return None
-    if pid <= 0 or not is_alive(pid):
+    if not 0 < pid < 2**31 or not is_alive(pid):
         return None
     now = process_start(pid)
     return pid if start is None or now is None or start == now else None

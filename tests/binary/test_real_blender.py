@@ -71,7 +71,8 @@ def test_a_run_in_the_window(gui, blend, plan):
     report = gui.wait_for("cancel", seconds=60)
     assert report["start"] == ["FINISHED"] and report["category"] == "Wildsmoke"
     phases = gui.wait_exit()["phases"]
-    assert phases == ["none", "starting", "running", "cancelling", "cancelled"]
+    # the cancelling is over in no time, and may fall between two looks
+    assert [phase for phase in phases if phase != "cancelling"] == ["none", "starting", "running", "cancelled"]
 
 
 def test_blender_never_freezes(gui, blend, plan):

@@ -336,7 +336,7 @@ def check_a_run_is_followed_by_the_timer(folder: Path) -> None:
         status = lambda: supervisor.status(folder / "job")  # noqa: E731
         tick_until(session, lambda: status().seconds_left is not None)
         drawn = draw("WILDSMOKE_PT_main")
-        assert "Visual (2 of 2)" in drawn and "[wildsmoke.cancel]" in drawn
+        assert "Fitting the look (2 of 2)" in drawn and "[wildsmoke.cancel]" in drawn
         assert any("left in this stage" in text for text in drawn)
         assert not bpy.ops.wildsmoke.start.poll()
         settings.output_folder = str(folder / "elsewhere")
