@@ -164,7 +164,16 @@ def simulate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
 
     Writes JOB/simulation: particles.h5 and a VDB sequence.
     """
-    raise NotImplementedError
+    from backend.simulation import simulate_job
+    from backend.stages.simulate import Rollout
+
+    began = time.monotonic()
+    if options.frames < 1:
+        raise BackendError("bad_frame_range", f"{options.frames} frames cannot be simulated.", hint="Give --frames 1 or more.")
+    sink.send(events.Hello(protocol=events.PROTOCOL_VERSION, version=__version__, device="cpu"))
+    rollout = Rollout(num_frames=options.frames, wind=options.wind, buoyancy=options.buoyancy)
+    folder = simulate_job(options.job, rollout, options.collider, sink, stop)
+    sink.send(events.Done(result=f"{folder.name}/particles.h5", seconds=round(time.monotonic() - began, 3)))
 
 
 def report(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from backend import __version__
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
@@ -23,13 +22,13 @@ from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.population import buoyancy_of
-from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.fit.state import PhysicalRecord, VisualRecord, particle_frame
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
 from backend.io.frame_stack import FrameStack, FrameStackWriter
 from backend.io.hdf5_file import whole_hdf5
 from backend.io.job_folder import JobFolder, file_fingerprint, fingerprint
-from backend.io.particles import ParticleFrame, Particles, ParticlesInfo, ParticlesWriter, read_particles
+from backend.io.particles import Particles, ParticlesInfo, ParticlesWriter, read_particles
 from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_stamp, stamp, write_records
 from backend.io.video import Clip, open_clip
 from backend.stages import cameras as cameras_stage
@@ -245,9 +244,9 @@ class Pipeline:
             ParticlesWriter(self.folder.particles) as writer,
         ):
             for record in seen:
-                writer.append(_particle_frame(record))
+                writer.append(particle_frame(record))
             for record in ahead:
-                writer.append(_particle_frame(record), is_forecast=True)
+                writer.append(particle_frame(record), is_forecast=True)
             last = fluid[len(fluid) - 1]
             learned = buoyancy_of(last)
             with open_stage_file(self.folder.smoke) as file:
@@ -345,17 +344,6 @@ def _json_entry(path: Path, name: str) -> Any:
     except (OSError, ValueError):
         return None
     return data.get(name) if isinstance(data, dict) else None
-
-
-def _particle_frame(record: VisualRecord) -> ParticleFrame:
-    return ParticleFrame(
-        positions=record.positions,
-        velocities=record.velocities,
-        scales=record.scales,
-        optical_masses=record.optical_masses,
-        colors=record.colors,
-        ids=record.ids,
-    )
 
 
 def _particles_fingerprint(path: Path) -> str | None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 _MODE_SHARE = 0.25  # of the frames that must agree: smoke may cover a pixel three quarters of the time

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-
 from backend.fit.connected import components
 from backend.io.images import LUMINANCE
 
@@ -38,7 +37,6 @@ class SmokeColor:
     @property
     def linear(self) -> np.ndarray:  # [3]
         return (self.brightness * self.direction).astype(np.float32)
-
 
     def limited(self, light: np.ndarray) -> np.ndarray:
         """Light of smoke [h, w, 3] with its tint held to what dense smoke shows; its luminance stays."""

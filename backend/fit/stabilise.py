@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-
 from backend.io.images import LUMINANCE, linear_to_srgb
 
 MAX_TRACKS = 400

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from backend.io.particles import ParticleFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,3 +38,15 @@ class VisualRecord:
     ids: np.ndarray  # [N] int64, never used twice
     born: np.ndarray  # [N] int32, frame
     next_id: np.ndarray  # [] int64
+
+
+def particle_frame(record: VisualRecord) -> ParticleFrame:
+    """The record as the asset holds it."""
+    return ParticleFrame(
+        positions=record.positions,
+        velocities=record.velocities,
+        scales=record.scales,
+        optical_masses=record.optical_masses,
+        colors=record.colors,
+        ids=record.ids,
+    )

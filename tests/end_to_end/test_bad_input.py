@@ -81,14 +81,14 @@ def mixed_sizes(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "code"),
     [
-        (lambda folder: folder / "nothing.mp4", "video_missing"),
-        (empty_file, "video_empty"),
-        (text_file, "video_unreadable"),
-        (truncated, "video_truncated"),
+        (lambda folder: folder / "nothing.mp4", "clip_missing"),
+        (empty_file, "clip_empty"),
+        (text_file, "clip_unreadable"),
+        (truncated, "clip_truncated"),
         (one_frame, "clip_too_short"),
         (one_pixel, "clip_too_small"),
         (no_smoke, "no_smoke"),
-        (mixed_sizes, "mixed_sizes"),
+        (mixed_sizes, "sequence_mixed_sizes"),
     ],
 )
 def test_bad_clips(make: Callable[[Path], Path], code: str, tmp_path: Path) -> None:
