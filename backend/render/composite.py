@@ -15,7 +15,8 @@ def composite(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     opacity = 1 - exp(-tau); the colour of a pixel is the mean of its smoke, weighted by optical depth, times opacity.
     """
     tau = image[0]
-    return image[1:] * _quotient(tau), -np.expm1(-tau)
+    opacity = -np.expm1(-tau)
+    return image[1:] * _quotient(tau, opacity), opacity
 
 
 def composite_backward(image: np.ndarray, grad_features: np.ndarray | None, grad_opacity: np.ndarray | None) -> np.ndarray:
@@ -27,19 +28,18 @@ def composite_backward(image: np.ndarray, grad_features: np.ndarray | None, grad
         grad[0] = grad_opacity * np.exp(-tau)
     if grad_features is not None:
         require_finite("grad_features", grad_features, image[1:].shape)
-        grad[1:] = grad_features * _quotient(tau)
+        grad[1:] = grad_features * _quotient(tau, -np.expm1(-tau))
         grad[0] += np.sum(grad_features * image[1:], axis=0) * _quotient_slope(tau)
     return grad
 
 
-def _quotient(tau: np.ndarray) -> np.ndarray:
-    """(1 - exp(-tau)) / tau, 1 at 0."""
-    safe = np.maximum(tau, 1e-30)
-    return np.where(tau > 1e-30, -np.expm1(-safe) / safe, 1.0).astype(tau.dtype)
+def _quotient(tau: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """opacity / tau, 1 at 0."""
+    return np.divide(opacity, tau, out=np.ones_like(tau), where=tau > 1e-30)
 
 
 def _quotient_slope(tau: np.ndarray) -> np.ndarray:
     """Derivative of _quotient: (exp(-tau) - quotient) / tau, -1/2 at 0; by its series where the difference cancels."""
     safe, small = np.maximum(tau, _SERIES_BELOW), np.minimum(tau, _SERIES_BELOW)
     series = -0.5 + small * (1 / 3 - small * (1 / 8 - small / 30))
-    return np.where(tau < _SERIES_BELOW, series, (np.exp(-safe) - _quotient(safe)) / safe).astype(tau.dtype)
+    return np.where(tau < _SERIES_BELOW, series, (np.exp(-safe) - _quotient(safe, -np.expm1(-safe))) / safe).astype(tau.dtype)

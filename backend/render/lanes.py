@@ -190,6 +190,18 @@ def muladd(typingctx: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @_operation
+def larger_magnitude(typingctx: Any, x: Any, y: Any) -> Any:
+    """max(x, |y|); x where y is not a number."""
+    del typingctx, x, y
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        magnitude = _builtin(builder, "fabs", args[1])
+        return builder.select(builder.fcmp_ordered(">", magnitude, args[0]), magnitude, args[0])
+
+    return lanes_type(lanes_type, lanes_type), codegen
+
+
+@_operation
 def flushed(typingctx: Any, x: Any, smallest: Any) -> Any:
     """x, with 0 in the lanes whose magnitude is below the float32 number `smallest`."""
     del typingctx, x, smallest

@@ -65,64 +65,51 @@ def _first_tap(fine_margin):
 
 
 @njit(cache=True, parallel=True)
-def widen(coarse, start, num_lines, stride, num_pairs, fine_margin, taps, out, out_stride):
-    """Along rows: out [num_lines, 2, out_stride] gets the even and the odd fine columns, num_pairs of each."""
+def widen(coarse, start, num_lines, stride, num_pairs, fine_margin, taps, wide, wide_stride):
+    """Along rows: wide [num_lines, wide_stride] gets coarse rows with fine columns."""
     first = _first_tap(fine_margin)
     for r in prange(num_lines):
-        source = start + r * stride + first
         for k in range(0, num_pairs, LANES):
             even = spread(np.float32(0))
             odd = spread(np.float32(0))
             for d in range(NUM_TAPS):
-                cells = load(coarse, source + k + d)
+                cells = load(coarse, start + r * stride + first + k + d)
                 even = muladd(cells, spread(taps[0, d]), even)
                 odd = muladd(cells, spread(taps[1, d]), odd)
-            store(out, (2 * r) * out_stride + k, flushed(even, SMALLEST))
-            store(out, (2 * r + 1) * out_stride + k, flushed(odd, SMALLEST))
+            store_interleaved(wide, r * wide_stride + 2 * k, flushed(even, SMALLEST), flushed(odd, SMALLEST))
 
 
 @njit(cache=True, parallel=True)
-def heighten(wide, wide_stride, coarse_rows, num_pairs, fine_margin, taps, fine, start, num_channels, num_rows, stride):
-    """Along columns: adds the up-sampled coarse level, wide [C, coarse_rows, 2, wide_stride], to the fine one."""
+def heighten(wide, wide_stride, coarse_rows, num_columns, fine_margin, taps, fine, start, num_channels, num_rows, stride):
+    """Along columns: adds wide [C, coarse_rows, wide_stride] to the fine level."""
     first = _first_tap(fine_margin)
     for line in prange(num_channels * num_rows):
         r = line % num_rows
-        source = (line // num_rows * coarse_rows + r // 2 + first) * 2 * wide_stride
-        for k in range(0, num_pairs, LANES):
-            even = spread(np.float32(0))
-            odd = spread(np.float32(0))
+        source = (line // num_rows * coarse_rows + r // 2 + first) * wide_stride
+        for x in range(0, num_columns, LANES):
+            cells = spread(np.float32(0))
             for d in range(NUM_TAPS):
-                weight = spread(taps[r % 2, d])
-                even = muladd(load(wide, source + 2 * d * wide_stride + k), weight, even)
-                odd = muladd(load(wide, source + (2 * d + 1) * wide_stride + k), weight, odd)
-            target = start + line * stride + 2 * k
-            even = add(flushed(even, SMALLEST), load_stride2(fine, target))
-            odd = add(flushed(odd, SMALLEST), load_stride2(fine, target + 1))
-            store_interleaved(fine, target, even, odd)
+                cells = muladd(load(wide, source + d * wide_stride + x), spread(taps[r % 2, d]), cells)
+            place = start + line * stride + x
+            store(fine, place, add(flushed(cells, SMALLEST), load(fine, place)))
 
 
 @njit(cache=True, parallel=True)
 def heighten_adjoint(
-    fine, start, num_channels, num_rows, stride, num_pairs, fine_margin, taps, wide, wide_stride, coarse_rows, lead
+    fine, start, num_channels, num_rows, stride, num_columns, fine_margin, taps, wide, wide_stride, coarse_rows, lead
 ):  # fmt: skip
-    """Transpose of heighten: writes wide [C, coarse_rows, 2, wide_stride]; columns begin at `lead`, zeros around them."""
+    """Transpose of heighten: writes wide [C, coarse_rows, wide_stride]; columns begin at `lead`, zeros around them."""
     first = _first_tap(fine_margin)
     for line in prange(num_channels * coarse_rows):
         channel, c = line // coarse_rows, line % coarse_rows
-        wide[2 * line * wide_stride : 2 * (line + 1) * wide_stride] = np.float32(0)
-        for k in range(0, num_pairs, LANES):
-            even = spread(np.float32(0))
-            odd = spread(np.float32(0))
-            for d in range(NUM_TAPS):
-                for parity in range(2):
-                    r = 2 * (c - first - d) + parity
-                    if 0 <= r < num_rows:
-                        source = start + (channel * num_rows + r) * stride + 2 * k
-                        weight = spread(taps[parity, d])
-                        even = muladd(load_stride2(fine, source), weight, even)
-                        odd = muladd(load_stride2(fine, source + 1), weight, odd)
-            store(wide, 2 * line * wide_stride + lead + k, flushed(even, SMALLEST))
-            store(wide, (2 * line + 1) * wide_stride + lead + k, flushed(odd, SMALLEST))
+        wide[line * wide_stride : (line + 1) * wide_stride] = np.float32(0)
+        low, high = max(2 * (c - first - NUM_TAPS + 1), 0), min(2 * (c - first) + 2, num_rows)
+        for x in range(0, num_columns, LANES):
+            cells = spread(np.float32(0))
+            for r in range(low, high):
+                weight = taps[r & 1, c - first - (r >> 1)]
+                cells = muladd(load(fine, start + (channel * num_rows + r) * stride + x), spread(weight), cells)
+            store(wide, line * wide_stride + lead + x, flushed(cells, SMALLEST))
 
 
 @njit(cache=True, parallel=True)
@@ -133,9 +120,9 @@ def widen_adjoint(wide, wide_stride, lead, fine_margin, taps, coarse, start, num
         for n in range(0, num_columns, LANES):
             cells = spread(np.float32(0))
             for d in range(NUM_TAPS):
-                source = 2 * r * wide_stride + lead + n - first - d
-                cells = muladd(load(wide, source), spread(taps[0, d]), cells)
-                cells = muladd(load(wide, source + wide_stride), spread(taps[1, d]), cells)
+                source = r * wide_stride + lead + 2 * (n - first - d)
+                cells = muladd(load_stride2(wide, source), spread(taps[0, d]), cells)
+                cells = muladd(load_stride2(wide, source + 1), spread(taps[1, d]), cells)
             store(coarse, start + r * stride + n, flushed(cells, SMALLEST))
         for n in range(num_columns, stride):
             coarse[start + r * stride + n] = np.float32(0)
@@ -143,38 +130,33 @@ def widen_adjoint(wide, wide_stride, lead, fine_margin, taps, coarse, start, num
 
 def upsample(buffer: np.ndarray, pyramid: Pyramid, num_channels: int) -> None:
     """Adds every level to the next finer one, coarsest first, in place; level 0 ends as the image."""
-    rows, strides = pyramid.rows, pyramid.strides
+    rows, columns, strides = pyramid.rows, pyramid.columns, pyramid.strides
     for level in range(len(rows) - 1, 0, -1):
-        fine_margin, num_pairs, wide_stride = _columns(pyramid, level)
-        wide = np.empty(num_channels * 2 * rows[level] * wide_stride + ROW_PADDING, np.float32)
+        fine_margin = MARGIN if level > 1 else 0
+        num_pairs = (columns[level - 1] + 1) // 2
+        wide_stride = strides[level - 1]
+        wide = np.empty(num_channels * rows[level] * wide_stride, np.float32)
         coarse, fine = num_channels * pyramid.offsets[level], num_channels * pyramid.offsets[level - 1]
         widen(buffer, coarse, num_channels * rows[level], strides[level], num_pairs, fine_margin, TAPS, wide, wide_stride)
         heighten(
-            wide, wide_stride, rows[level], num_pairs, fine_margin, TAPS, buffer, fine, num_channels, rows[level - 1],
+            wide, wide_stride, rows[level], columns[level - 1], fine_margin, TAPS, buffer, fine, num_channels, rows[level - 1],
             strides[level - 1],
         )  # fmt: skip
 
 
 def upsample_adjoint(buffer: np.ndarray, pyramid: Pyramid, num_channels: int) -> None:
     """Transpose of upsample: from the gradient on level 0 (its padding zero) those on all the others, in place."""
-    rows, strides = pyramid.rows, pyramid.strides
-    lead = 2 * LANES
+    rows, columns, strides = pyramid.rows, pyramid.columns, pyramid.strides
+    lead = 4 * LANES  # the reach of the taps before the first fine column
     for level in range(1, len(rows)):
-        fine_margin, num_pairs, wide_stride = _columns(pyramid, level)
-        wide_stride += 2 * lead
-        wide = np.empty(num_channels * 2 * rows[level] * wide_stride + ROW_PADDING, np.float32)
+        fine_margin = MARGIN if level > 1 else 0
+        wide_stride = strides[level - 1] + 2 * lead + 4 * LANES
+        wide = np.empty(num_channels * rows[level] * wide_stride, np.float32)
         coarse, fine = num_channels * pyramid.offsets[level], num_channels * pyramid.offsets[level - 1]
         heighten_adjoint(
-            buffer, fine, num_channels, rows[level - 1], strides[level - 1], num_pairs, fine_margin, TAPS, wide, wide_stride,
-            rows[level], lead,
+            buffer, fine, num_channels, rows[level - 1], strides[level - 1], columns[level - 1], fine_margin, TAPS, wide,
+            wide_stride, rows[level], lead,
         )  # fmt: skip
         widen_adjoint(
-            wide, wide_stride, lead, fine_margin, TAPS, buffer, coarse, num_channels * rows[level], pyramid.columns[level],
-            strides[level],
-        )  # fmt: skip
-
-
-def _columns(pyramid: Pyramid, level: int) -> tuple[int, int, int]:
-    """For up-sampling from `level`: margin of the finer level, its pairs of columns, elements for a padded row of them."""
-    num_pairs = (int(pyramid.columns[level - 1]) + 1) // 2
-    return (MARGIN if level > 1 else 0), num_pairs, (num_pairs + 2 * LANES - 1) // LANES * LANES
+            wide, wide_stride, lead, fine_margin, TAPS, buffer, coarse, num_channels * rows[level], columns[level], strides[level]
+        )

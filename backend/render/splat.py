@@ -192,12 +192,15 @@ def _drawn(
 
 def _gradient_levels(name: str, grad_image: np.ndarray, pyramid: Pyramid) -> tuple[np.ndarray, float]:
     """The gradient [C, H, W] on all levels, flat, divided by its largest magnitude, and that magnitude."""
-    buffer = np.empty(len(grad_image) * pyramid.offsets[-1], np.float32)
-    per_row = np.empty(grad_image.shape[0] * grad_image.shape[1])
-    largest_magnitude(grad_image, per_row)
-    scale = float(np.max(per_row))  # NaN if there is any
+    values = np.ascontiguousarray(grad_image, np.float32).reshape(-1)
+    per_chunk = np.empty(64, np.float32)
+    largest_magnitude(values, per_chunk)
+    scale = float(np.max(per_chunk))  # NaN if there is any
     if not np.isfinite(scale):
         raise ValueError(f"{name} holds NaN or infinity")
-    scaled_into(grad_image, 1.0 / scale if scale > 0 else 0.0, np.float32(FAINTEST), buffer, pyramid.strides[0])
+    buffer = np.empty(len(grad_image) * pyramid.offsets[-1], np.float32)
+    # In two steps, because 1 / scale may lie beyond float32.
+    power = float(2.0 ** -np.floor(np.log2(scale))) if scale > 0 else 0.0
+    scaled_into(values, grad_image.shape[2], power, np.float32(FAINTEST), buffer, pyramid.strides[0])
     upsample_adjoint(buffer, pyramid, len(grad_image))
-    return buffer, scale
+    return buffer, (1.0 / power if scale > 0 else 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 
 from .binning import BAND_ROWS
-from .lanes import LANES, add, exponential, load, muladd, multiply, ramp, spread, store, total
+from .lanes import LANES, add, exponential, larger_magnitude, load, muladd, multiply, ramp, spread, store, total
 from .projection import CUT
 
 NARROW = 4 * LANES  # columns
@@ -207,26 +207,34 @@ def gather(slots, slot_starts, num_chunks, sums):
 
 
 @njit(cache=True, parallel=True)
-def largest_magnitude(image, per_row):
-    """per_row [C H]: largest |value| in each row of image [C, H, W]; NaN where a number is not finite."""
-    num_rows = image.shape[1]
-    for r in prange(per_row.shape[0]):
-        line = image[r // num_rows, r % num_rows]
-        largest, nothing = line[0] * 0, line[0] * 0
-        for x in range(line.shape[0]):
-            largest = max(largest, abs(line[x]))
-            nothing += line[x] * 0
-        per_row[r] = largest + nothing
+def largest_magnitude(values, per_chunk):
+    """per_chunk [C]: largest |value| in each of C equal parts of values (flat float32); NaN if one is not finite."""
+    num, num_chunks = values.shape[0], per_chunk.shape[0]
+    zero = np.float32(0)
+    for chunk in prange(num_chunks):
+        start, stop = chunk * num // num_chunks, (chunk + 1) * num // num_chunks
+        whole = start + ((stop - start) & -LANES)
+        found = np.zeros(LANES, np.float32)
+        magnitudes, nothing = spread(zero), spread(zero)
+        for k in range(start, whole, LANES):
+            cells = load(values, k)
+            magnitudes = larger_magnitude(magnitudes, cells)
+            nothing = muladd(cells, spread(zero), nothing)  # 0, or NaN
+        store(found, 0, add(magnitudes, nothing))
+        largest, missing = zero, zero
+        for x in found:
+            largest, missing = max(largest, x), missing + x * zero
+        for k in range(whole, stop):
+            largest, missing = max(largest, abs(values[k])), missing + values[k] * zero
+        per_chunk[chunk] = largest + missing
 
 
 @njit(cache=True, parallel=True)
-def scaled_into(image, factor, smallest, out, stride):
-    """out (flat, rows of `stride` elements): image [C, H, W] times factor, 0 below smallest; zeros beyond the width."""
-    num_channels, num_rows, width = image.shape
-    for r in prange(num_channels * num_rows):
-        line = image[r // num_rows, r % num_rows]
+def scaled_into(values, width, factor, smallest, out, stride):
+    """out (rows of `stride` elements) gets the rows of `width` of values, times factor, 0 below smallest; then zeros."""
+    for r in prange(values.shape[0] // width):
         for x in range(width):
-            value = np.float32(line[x] * factor)
+            value = values[r * width + x] * factor
             out[r * stride + x] = value if abs(value) > smallest else np.float32(0)
         for x in range(width, stride):
             out[r * stride + x] = np.float32(0)
