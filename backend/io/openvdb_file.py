@@ -70,7 +70,7 @@ def _grid(module: ModuleType, name: str, array: np.ndarray, transform: list[list
     grid.name = name
     grid.transform = module.createLinearTransform(transform)
     grid.gridClass = module.GridClass.UNKNOWN if is_vector else module.GridClass.FOG_VOLUME
-    peak = float(np.abs(array).max(initial=0.0))
+    peak = max(float(array.max(initial=0.0)), -float(array.min(initial=0.0)))
     grid.saveFloatAsHalf = peak == 0.0 or _HALF_MIN <= peak <= _HALF_MAX
     return grid
 
