@@ -27,6 +27,7 @@ PYTHON_VARIABLE = "WILDSMOKE_BACKEND_PYTHON"
 DEFAULT_FOLDER = "wildsmoke-backend"  # in the home folder: outlives Blender's versions and the extension's updates
 CHECK_SECONDS = 120.0  # a first import of torch from a slow disk takes its time
 IMPORT_NAMES = {"opencv-python-headless": "cv2"}
+_SUPPORTED = f"3.{OLDEST_PYTHON[1]} to 3.{NEWEST_PYTHON[1]}"
 _MARK = "WILDSMOKE-CHECK "
 
 PROBE = r"""
@@ -98,8 +99,14 @@ def read_requirements(root: Path) -> dict[str, str]:
     return {name: version for name, _, version in pinned}
 
 
-def set_up_commands(root: Path, *, python: str, home: Path, platform: str = sys.platform) -> tuple[str, ...]:
-    """What to type in a terminal to make the backend's environment where the add-on looks for it."""
+def set_up_commands(root: Path, *, python: str | None, home: Path, platform: str = sys.platform) -> tuple[str, ...]:
+    """What to type in a terminal to make the backend's environment where the add-on looks for it.
+
+    python: the one to make it with; None where this machine has none that will do.
+    """
+    if python is None:
+        first = f"# first install Python {_SUPPORTED}"
+        return first, *set_up_commands(root, python=f"python3.{NEWEST_PYTHON[1]}", home=home, platform=platform)
     folder = home / DEFAULT_FOLDER
     requirements = root / "backend" / "requirements.txt"
     commands = (
@@ -111,13 +118,13 @@ def set_up_commands(root: Path, *, python: str, home: Path, platform: str = sys.
     return tuple(shlex.join(words) for words in commands)
 
 
-def python_for_set_up() -> str:
-    """A Python on this machine that the backend's packages support; Blender's own makes an environment as well."""
+def python_for_set_up() -> str | None:
+    """A Python on this machine that the backend's packages support; Blender's own can make an environment as well."""
     for minor in range(OLDEST_PYTHON[1], NEWEST_PYTHON[1] + 1):
         found = shutil.which(f"python3.{minor}")
         if found:
             return found
-    return sys.executable
+    return sys.executable if OLDEST_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON else None
 
 
 def judge(report: Mapping[str, Any], requirements: Mapping[str, str], *, python: str, commands: tuple[str, ...]) -> Finding:
@@ -126,8 +133,7 @@ def judge(report: Mapping[str, Any], requirements: Mapping[str, str], *, python:
     has_python = OLDEST_PYTHON <= version[:2] <= NEWEST_PYTHON
     lines = [(has_python, f"Python {'.'.join(map(str, version))} at {python}")]
     if not has_python:
-        oldest, newest = (".".join(map(str, pair)) for pair in (OLDEST_PYTHON, NEWEST_PYTHON))
-        lines.append((False, f"The backend needs Python {oldest} to {newest}"))
+        lines.append((False, f"The backend needs Python {_SUPPORTED}"))
     is_usable = has_python
     for name, wanted in requirements.items():
         entry = report["packages"].get(name, {"version": None, "problem": "not probed"})

@@ -16,6 +16,7 @@ SECTIONS = (
     ("forecast", "Forecast"),
     ("export", "Volume"),
 )
+BACKEND_CODES = ("backend_not_set", "backend_python_missing")  # mended in the preferences
 _ICONS = {
     Phase.DONE: "CHECKMARK",
     Phase.FAILED: "ERROR",
@@ -46,8 +47,9 @@ class WILDSMOKE_PT_main(_SidebarPanel, bpy.types.Panel):
         form.enabled = not status.phase.is_active
         form.use_property_split = True
         form.use_property_decorate = False
-        for name in ("video", "output_folder", "preset", "device", "cameras_file"):
+        for name in ("video", "output_folder", "preset", "device"):
             form.prop(settings, name)
+        form.prop(settings, "cameras_file", placeholder="optional")
         _draw_range(form, settings)
         _draw_buttons(layout, settings, status)
         running = supervisor.running_folder
@@ -94,10 +96,12 @@ def draw_status(layout: bpy.types.UILayout, status: JobStatus, *, width: int) ->
     for text, icon in ((status.message, "NONE"), (status.hint, "INFO" if is_bad else "NONE")):
         if text:
             draw_paragraph(box, text, width=width, icon=icon)
-    if is_bad:
+    if status.code in BACKEND_CODES:
         box.operator("wildsmoke.open_preferences", icon="PREFERENCES")
+    elif status.phase is Phase.CRASHED:
+        box.operator("wildsmoke.open_log", icon="TEXT")
     for warning in status.warnings:
-        draw_paragraph(box, warning, width=width, icon="QUESTION")
+        draw_paragraph(box, warning, width=width, icon="INFO")
 
 
 class WILDSMOKE_PT_settings(_SidebarPanel, bpy.types.Panel):

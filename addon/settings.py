@@ -34,7 +34,7 @@ class WILDSMOKE_PG_frames(bpy.types.PropertyGroup):
     """Decoding."""
 
     working_size: IntProperty(
-        name="Working Size (px)",
+        name="Size (px)",
         description="Longest side of the frames that are fitted; larger ones are reduced",
         default=320,
         min=16,
@@ -54,7 +54,7 @@ class WILDSMOKE_PG_extraction(bpy.types.PropertyGroup):
     """The smoke layer."""
 
     mode: EnumProperty(
-        name="Smoke Layer",
+        name="Source",
         description="Where the smoke's colour and opacity come from",
         items=(
             ("auto", "Automatic", "Recognise an alpha channel and smoke on black, else matte"),
@@ -91,7 +91,7 @@ class WILDSMOKE_PG_cameras(bpy.types.PropertyGroup):
     """The camera, where none is given."""
 
     mode: EnumProperty(
-        name="Camera",
+        name="Source",
         description="Where the camera comes from",
         items=(
             ("auto", "Automatic", "The cameras.json where there is one, else a camera that stands still"),

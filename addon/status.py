@@ -19,6 +19,7 @@ STAGE_LABELS = {
     "forecast": "Forecasting",
     "export": "Writing the volume",
 }
+RESUMING = "Resume goes on where it stopped."
 MAX_SECONDS = 1e7  # nobody waits longer; also keeps absurd numbers out of the arithmetic
 
 
@@ -52,6 +53,7 @@ class JobStatus:
     stage_count: int = 0
     fraction: float = 0.0
     seconds_left: float | None = None
+    code: str = ""
     message: str = ""
     hint: str = ""
     warnings: tuple[str, ...] = ()
@@ -90,7 +92,7 @@ def after(status: JobStatus, event: events.Event) -> JobStatus:
         case events.Done():
             return replace(status, fraction=1.0, seconds_left=None)
         case events.Error():
-            return replace(status, message=event.message, hint=event.hint, seconds_left=None)
+            return replace(status, code=event.code, message=event.message, hint=event.hint, seconds_left=None)
         case _:
             return status
 
@@ -118,7 +120,7 @@ def ended(status: JobStatus, state: RunState, *, log_tail: list[str], log: str, 
         case RunState.FAILED:
             return replace(status, phase=Phase.FAILED)
         case RunState.CANCELLED:
-            return replace(status, phase=Phase.CANCELLED, message="", hint="", seconds_left=None)
+            return replace(status, phase=Phase.CANCELLED, message="", hint=RESUMING, seconds_left=None)
         case _:
             words = [line for line in log_tail if not line.startswith(NOISE_PREFIX)]
             reason = f" Its last words: {words[-1]}" if words else ""
@@ -126,7 +128,7 @@ def ended(status: JobStatus, state: RunState, *, log_tail: list[str], log: str, 
                 status,
                 phase=Phase.CRASHED,
                 message=f"The backend ended without a word (exit code {exit_code}).{reason}",
-                hint=f"Read {log}, then press Start: the job resumes where it stopped.",
+                hint=f"{RESUMING} The whole log: {log}",
                 seconds_left=None,
             )
 
@@ -146,7 +148,7 @@ def found(state: JobState) -> JobStatus:
             return JobStatus(
                 phase=Phase.INTERRUPTED,
                 message=state.problem or "The job stopped before its end.",
-                hint="" if state.problem else "Press Start: it resumes where it stopped.",
+                hint="" if state.problem else RESUMING,
             )
         case _:
             return JobStatus()
@@ -159,7 +161,7 @@ _HEADLINES = {
     Phase.CANCELLING: "Stopping",
     Phase.DONE: "Finished",
     Phase.FAILED: "Failed",
-    Phase.CANCELLED: "Cancelled; Start resumes",
+    Phase.CANCELLED: "Cancelled",
     Phase.CRASHED: "The backend crashed",
     Phase.INTERRUPTED: "Interrupted",
     Phase.BUSY: "Busy",

@@ -67,7 +67,7 @@ class Supervisor:
         try:
             runner.start(job)
         except BackendError as error:
-            self._statuses[folder] = JobStatus(phase=Phase.FAILED, message=error.message, hint=error.hint)
+            self._statuses[folder] = JobStatus(phase=Phase.FAILED, code=error.code, message=error.message, hint=error.hint)
             raise
         self.runner = runner
         self._statuses[folder] = JobStatus(phase=Phase.STARTING)
@@ -120,7 +120,7 @@ class Supervisor:
 
     def note(self, folder: Path, error: BackendError) -> None:
         """Show an error beside what else is known of a folder."""
-        self._statuses[folder] = replace(self.status(folder), message=error.message, hint=error.hint)
+        self._statuses[folder] = replace(self.status(folder), code=error.code, message=error.message, hint=error.hint)
 
     def cancel(self) -> bool:
         """Ask the run to stop; whether there was one."""

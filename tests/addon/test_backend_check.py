@@ -149,3 +149,10 @@ def test_a_python_for_set_up_is_found_or_blenders_own(monkeypatch):
     assert backend_check.python_for_set_up() == "/usr/bin/python3.12"
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert backend_check.python_for_set_up() == sys.executable
+    monkeypatch.setattr(backend_check, "NEWEST_PYTHON", (3, 9))
+    assert backend_check.python_for_set_up() is None
+
+
+def test_without_any_python_that_will_do_it_says_so_first():
+    first, make, _ = set_up_commands(Path("/opt/x"), python=None, home=Path("/home/a"), platform="linux")
+    assert first == "# first install Python 3.11 to 3.13" and make.startswith("python3.13 -m venv")
