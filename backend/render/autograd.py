@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from backend.geometry.camera import View
 from torch import Tensor
+
+from backend.geometry.camera import View
 
 from . import projection, splat
 from .gaussians import Gaussians

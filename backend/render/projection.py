@@ -16,8 +16,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from backend.geometry.camera import View
 from numba import njit, prange
+
+from backend.geometry.camera import View
 
 NEAR = 0.01  # m; splats fade in from here to twice this depth
 TANGENT_LIMIT = 1.3  # of the tangent of half the field of view: where the Jacobian is held
@@ -68,13 +69,13 @@ def make_lens(view: View, near: float) -> Lens:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def narrowing(level: int) -> float:
     """Variance [px^2] that up-sampling from a level down to the image adds: kernel variance times 4^1 + ... + 4^level."""
-    return KERNEL_VARIANCE * 4.0 * (4.0**level - 1.0) / 3.0
+    return KERNEL_VARIANCE * 4.0 * ((1 << 2 * level) - 1.0) / 3.0
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _rotate(q, rotation, local):
     """local [9] = camera-from-world rotation [3, 3] times the rotation of the quaternion q [4] / |q|, row by row."""
     n = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -86,7 +87,7 @@ def _rotate(q, rotation, local):
         local[3 * r + 2] = r0 * 2 * (x * z + w * y) + r1 * 2 * (y * z - w * x) + r2 * (1 - 2 * (x * x + y * y))
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def fade_in(z, near):
     """Smooth step from 0 at near to 1 at twice near, and its derivative [1/m]."""
     t = (z - near) / near
@@ -95,7 +96,7 @@ def fade_in(z, near):
     return t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / near
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def project_one(position, quaternion, scales, lens, local, m):
     """One Gaussian: camera-axes position, tangents held in range; fills local [9] and, if it is seen, m [6] = J local S."""
     w = lens.rotation
@@ -114,7 +115,7 @@ def project_one(position, quaternion, scales, lens, local, m):
     return x, y, z, tx, ty
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def determinant_of(m):
     """Squared cross product of the two rows of m [6], and the cross product."""
     n0 = m[1] * m[5] - m[2] * m[4]
@@ -123,7 +124,7 @@ def determinant_of(m):
     return n0 * n0 + n1 * n1 + n2 * n2, n0, n1, n2
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _level(m, num_levels):
     """The level whose cells are as coarse as the smaller variance of the dilated splat allows."""
     top, side = m[0] * m[0] + m[1] * m[1] + m[2] * m[2], m[3] * m[3] + m[4] * m[4] + m[5] * m[5]
@@ -131,19 +132,19 @@ def _level(m, num_levels):
     dilated = determinant_of(m)[0] + DILATION * (top + side) + DILATION * DILATION
     smallest = dilated / (0.5 * (top + side) + DILATION + math.hypot(0.5 * (top - side), across))
     level = 0
-    while level + 1 < num_levels and smallest >= LEVEL_VARIANCE * 4.0 ** (level + 1):
+    while level + 1 < num_levels and smallest >= LEVEL_VARIANCE * (4 << 2 * level):
         level += 1
     return level
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _reach(centre, variance, cell, count):
     """First and last of `count` cells within the cut of a Gaussian with this variance [px^2]."""
     reach = math.sqrt(2 * CUT * variance) / cell
     return math.ceil(min(max(centre - reach, 0.0), float(count))), math.floor(max(min(centre + reach, count - 1.0), -1.0))
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _splat_one(u, v, level, m, lens, splat, box):
     """Fills one splat but for its mass; False where it touches no cell of its level."""
     det = determinant_of(m)[0]
@@ -151,7 +152,7 @@ def _splat_one(u, v, level, m, lens, splat, box):
     across = m[0] * m[3] + m[1] * m[4] + m[2] * m[5]
     added = DILATION - narrowing(level)
     det, variance_x, variance_y = det + added * (top + side) + added * added, top + added, side + added
-    cell = 2.0**level
+    cell = float(1 << level)
     margin = MARGIN if level else 0
     centre_x, centre_y = u / cell - 0.5 + margin, v / cell - 0.5 + margin
     box[0], box[1] = _reach(centre_y, variance_y, cell, math.ceil(lens.height / cell) + 2 * margin)

@@ -21,14 +21,14 @@ class Found(NamedTuple):
     camera: np.ndarray  # [chunks, 6]
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _covariance_gradient(m, level, sums, splat, dm):
     """Gradient with respect to m [6] from the sums of one splat; adds to dm [6]. sums: see splat_kernels, in cells.
 
     With A the amplitude, L = A sums0 and so on: dL/da = A (S0/a - S2) / 2, dL/db = A (S0/b - Y2) / 2, dL/ds = A a X.
     """
     a, b, s = splat[2], splat[3], splat[4]
-    cell2 = 4.0**level
+    cell2 = float(1 << 2 * level)
     added = DILATION - narrowing(level)
     det, n0, n1, n2 = determinant_of(m)
     top, side = m[0] * m[0] + m[1] * m[1] + m[2] * m[2], m[3] * m[3] + m[4] * m[4] + m[5] * m[5]
@@ -54,7 +54,7 @@ def _covariance_gradient(m, level, sums, splat, dm):
     dm[5] += n0 * m[1] - n1 * m[0]
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _quaternion_gradient(q, d, out):
     """Gradient with respect to q [4] from d [9], the one of the matrix of q / |q|; tangent to the unit sphere."""
     n = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -68,7 +68,7 @@ def _quaternion_gradient(q, d, out):
     out[2], out[3] = (gy - y * along) * n, (gz - z * along) * n
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _position_gradient(p, scales, local, m, dm, du, dv, d_log_mass, lens):
     """Camera-axes gradient of a position p (x, y, z, tx, ty): through the centre, the Jacobian and the mass.
 
@@ -92,7 +92,7 @@ def _position_gradient(p, scales, local, m, dm, du, dv, d_log_mass, lens):
     return dx, dy, dz
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _shape_gradient(p, quaternion, scales, local, dm, lens, d_local, d_world, d_scales, d_quaternion):
     """Through m = J local S: fills d_scales [3] and d_quaternion [4]; returns the turning moment of the shape [3]."""
     _, _, z, tx, ty = p
@@ -132,7 +132,7 @@ def project_backward(positions, scales, rotations, masses, lens, num_chunks, spl
             d_masses[i] = sums[i, 0] * peak * to_px2
             for k in range(6):
                 scaled[k] = masses[i] * to_px2 * peak * sums[i, k]
-            cell = 2.0 ** levels[i]
+            cell = float(1 << levels[i])
             _covariance_gradient(m, levels[i], scaled, splats[i], dm)
             du, dv = a * scaled[1] / cell, (b * scaled[3] - a * s * scaled[1]) / cell
             dx, dy, dz = _position_gradient(p, scales[i], local, m, dm, du, dv, scaled[0], lens)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+
 from backend.geometry.camera import View
 
 from . import projection

@@ -38,7 +38,7 @@ def _row(u, v, a, b, s, left, right, row, num_columns):
     return left, count, np.float32(left - centre), np.float32(exponent), np.float32(dy)
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _place(pyramid, bins, band, num_channels):
     """Of a band: element where its level starts, elements per channel and per row, columns, first row, row after the last."""
     level = bins.band_levels[band]

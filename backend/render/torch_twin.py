@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 
 import torch
-from backend.geometry.camera import View
 from torch import Tensor
+
+from backend.geometry.camera import View
 
 from .projection import DILATION, NEAR, TANGENT_LIMIT
 
