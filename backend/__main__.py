@@ -51,6 +51,8 @@ def guarded(work: Callable[[], None], sink: EventSink, job: Path | None) -> int:
     except BackendError as error:
         write_log(job, f"{error.code}: {error}")
         sink.send(events.Error(code=error.code, message=error.message, hint=error.hint, stage=error.stage))
+        if isinstance(sink, PipeSink):
+            print(f"wildsmoke: {error}", file=sys.stderr)  # for a person who reads the pipe's other end
         return EXIT_USER
     except Exception as error:  # noqa: BLE001 the one place where a defect becomes an event
         text = traceback.format_exc()

@@ -8,10 +8,11 @@ import threading
 import time
 from typing import IO, Protocol
 
-from backend.contract import events
-from backend.contract.errors import Cancelled
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from backend.contract import events
+from backend.contract.errors import Cancelled
 
 STOP_AFTER_ORPHANED = 1.5  # seconds a step may still take once Blender is gone
 STOP_AFTER_CANCEL = 5.0  # seconds a step may still take after a cancel

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from backend import __version__
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
@@ -79,7 +80,7 @@ class Pipeline:
             source = clip.fingerprint
             frames_mark = self._frames(clip)
             smoke_mark = self._smoke(frames_mark, has_alpha=clip.has_alpha)
-            cameras_mark = self._cameras(smoke_mark, given)
+            cameras_mark = self._cameras(smoke_mark, given, size=(clip.width, clip.height))
         physical_mark = self._physical(smoke_mark, cameras_mark)
         visual_mark = self._visual(smoke_mark, cameras_mark, physical_mark)
         forecast_mark = self._forecast(smoke_mark, cameras_mark, visual_mark)
@@ -133,7 +134,7 @@ class Pipeline:
         self._stage("smoke", mark, read_stamp(self.folder.smoke), write)
         return mark
 
-    def _cameras(self, smoke_mark: str, given: Cameras | None) -> str:
+    def _cameras(self, smoke_mark: str, given: Cameras | None, *, size: tuple[int, int]) -> str:
         mark = fingerprint("cameras", self.config.cameras, smoke_mark, given.to_json() if given else None)
 
         def write(report: StageReport) -> None:
@@ -142,7 +143,7 @@ class Pipeline:
                 solved = cameras_stage.run(
                     num_frames=len(stack),
                     frame_start=int(source.attrs["frame_start"]),  # type: ignore[arg-type]
-                    size=(stack.shape[1], stack.shape[0]),
+                    size=size,
                     fps=float(source.attrs["fps"]),  # type: ignore[arg-type]
                     config=self.config.cameras,
                     given=given,

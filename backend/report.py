@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+
 from backend.contract.cameras import read_cameras
 from backend.contract.result import read_result
 from backend.fit.scene import make_scene

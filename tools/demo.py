@@ -13,6 +13,17 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 CLIP = CHECKOUT / "synthetic" / "samples" / "demo_plume.mp4"
 
 
+def run(title: str, command: list[str], *, log: Path) -> int:
+    """One step: the backend's progress where somebody watches, everything else to the log."""
+    is_watched = title == "reconstruct" and sys.stdout.isatty()
+    if not is_watched:
+        print(f"{title} ...", flush=True)
+    with open(log, "a", encoding="utf-8") as output:
+        where = None if is_watched else output
+        environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+        return subprocess.run(command, cwd=CHECKOUT, env=environment, stdout=where, check=False).returncode
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="wildsmoke demo", description=__doc__)
     parser.add_argument("--blender-python", required=True, help=argparse.SUPPRESS)
@@ -28,11 +39,11 @@ def main() -> int:
         [*backend, "report", "--job", str(job), "--out", str(report)],
         [*blender, "--job", str(job), "--blend", str(blend), "--preview", str(preview)],
     )
-    for step in steps:
-        if not sys.stdout.isatty() and "reconstruct" in step:
-            print("wildsmoke: reconstructing; progress in a terminal only", flush=True)
-        code = subprocess.run(step, cwd=CHECKOUT, env={**os.environ, "PYTHONPATH": str(CHECKOUT)}, check=False).returncode
+    job.mkdir(parents=True, exist_ok=True)
+    for title, step in zip(("reconstruct", "report", "Blender"), steps, strict=True):
+        code = run(title, step, log=job / "demo.log")
         if code:
+            print(f"{title} ended with code {code}; what it printed is in {job / 'demo.log'}", file=sys.stderr)
             return code
     print(f"\ndone in {time.monotonic() - began:.0f} s")
     for title, path in (

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take

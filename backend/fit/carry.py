@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.physics.fluid import FluidState
 from backend.physics.interpolate import interpolate_velocity

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from backend.geometry.camera import View
 
 MAX_SIDE = 160  # px on which the balls are laid; the prior is smooth, more is waste

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from backend.render import splat as renderer
 
 FLOOR = 1e-3  # optical depth that one 8-bit step of opacity cannot show; keeps ratios of nothing to nothing at one

@@ -6,6 +6,7 @@ import dataclasses
 from typing import TypeVar
 
 import numpy as np
+
 from backend.fit.depth_prior import plane_depth
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.state import PhysicalRecord, VisualRecord

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
 from backend.contract.cameras import Cameras
 from backend.geometry.camera import View, view_at
 

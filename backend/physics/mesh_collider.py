@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from backend.contract.errors import BackendError
 from scipy.spatial import KDTree
+
+from backend.contract.errors import BackendError
 
 SAMPLES_PER_SIDE = 64  # of the mesh's longest side
 _HINT = "Export the mesh as a closed Wavefront .obj, in metres, z up."

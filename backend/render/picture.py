@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 from backend.contract.cameras import Cameras
 from backend.geometry.camera import View, view_at
 from backend.io import images

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+
 from backend.contract.cameras import Cameras
 from backend.contract.job import ForecastConfig, VisualConfig
 from backend.fit.appearance import Appearance

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+
 from backend.contract.cameras import Cameras
 from backend.contract.job import PhysicalConfig
 from backend.fit import depth_prior, explain, image_motion

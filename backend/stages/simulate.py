@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from backend.contract.errors import BackendError
 from backend.contract.job import PhysicalConfig
 from backend.fit.carry import as_fluid, carry, with_velocities

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+
 from backend.contract.cameras import Cameras
 from backend.contract.job import VisualConfig
 from backend.fit.appearance import Appearance

@@ -179,7 +179,9 @@ def test_records_take_and_join() -> None:
     appearance = Appearance(scene, [layer], VisualConfig(num_particles=100, iterations=0), 0)
     record, _ = appearance.look(appearance.empty(), 0)
     half = take(record, np.arange(len(record.positions)) % 2 == 0)
-    newborn = {name: getattr(half, name)[:3] for name in ("positions", "velocities", "scales", "optical_masses", "colors", "born")}
+    newborn = {
+        name: getattr(half, name)[:3] for name in ("positions", "velocities", "scales", "optical_masses", "colors", "born")
+    }
     more = join(half, **newborn)
     assert len(more.positions) == len(half.positions) + 3
     assert len(set(more.ids.tolist())) == len(more.ids)
