@@ -91,7 +91,10 @@ def fill_in() -> bool:
     settings = bpy.context.scene.wildsmoke
     settings.output_folder = PLAN["job_folder"]
     settings.video = PLAN["video"]
-    settings.import_when_done = False
+    settings.import_when_done = PLAN.get("import", False)
+    for name, value in PLAN.get("settings", {}).items():
+        group, _, field = name.rpartition(".")
+        setattr(settings.path_resolve(group) if group else settings, field, value)
     return True
 
 
@@ -116,6 +119,11 @@ def wait_half_second() -> bool:
 
 def wait_busy_gone() -> bool:
     return status().phase.value != "busy"
+
+
+def wait_import() -> bool:
+    REPORT["objects"] = sorted(f"{made.type}" for made in bpy.context.scene.objects)
+    return "VOLUME" in REPORT["objects"]
 
 
 def cancel() -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import time
@@ -100,6 +101,21 @@ def test_all_panels_open(gui, blend, plan):
 def test_preferences_say_what_to_do(gui, blend, plan):
     gui.start(blend, **plan, steps=["check_backend", "show_preferences", "shot preferences", "hold"])
     assert gui.wait_for("holding", seconds=60)["finding"] == ["There is no backend yet."]
+
+
+def test_the_real_backend_from_clip_to_volume(gui, blend, tmp_path):
+    """Needs WILDSMOKE_BACKEND_PYTHON: a Python with the backend's packages, and WILDSMOKE_CLIP: any clip of smoke."""
+    clip = os.environ.get("WILDSMOKE_CLIP", "")
+    if not clip or not os.environ.get("WILDSMOKE_BACKEND_PYTHON"):
+        pytest.skip("WILDSMOKE_CLIP or WILDSMOKE_BACKEND_PYTHON is not set")
+    small = {"use_frame_range": True, "frame_stop": 4, "config.frames.working_size": 96, "config.export.max_voxels": 48}
+    small |= {"preset": "draft", "config.physical.num_particles": 300, "config.visual.num_particles": 600}
+    plan = {"job_folder": str(tmp_path / "job"), "video": clip, "import": True, "settings": small}
+    steps = ["open_sidebar", "check_backend", "fill_in", "start", "wait_end", "wait_import", "shot imported", "hold"]
+    gui.start(blend, **plan, steps=steps)
+    report = gui.wait_for("holding", seconds=400)
+    assert report["phases"][-1] == "done" and "VOLUME" in report["objects"]
+    assert report["longest_gap"] < 3.0, report  # the import, with the first VDB file read, is the longest
 
 
 @pytest.mark.parametrize("how", ["quit", "kill"])
