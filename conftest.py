@@ -11,6 +11,8 @@ CHECKOUT = Path(__file__).resolve().parent
 if str(CHECKOUT) not in sys.path:
     sys.path.insert(0, str(CHECKOUT))
 
+import backend.kernel_setup  # noqa: E402, F401 before numba, whichever test imports it first
+
 if "wildsmoke" not in sys.modules and (CHECKOUT / "__init__.py").exists():
     spec = importlib.util.spec_from_file_location(
         "wildsmoke", CHECKOUT / "__init__.py", submodule_search_locations=[str(CHECKOUT)]
