@@ -16,18 +16,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from backend.contract.errors import BackendError
 from scipy.spatial import KDTree
+
+from backend.contract.errors import BackendError
 
 from .colliders import Collider, Vector, deflect, push_out
 from .kernels import POLY6, SPIKY_SQUARED_GRADIENT
 from .neighbours import Neighbours, build_grid, find_neighbours
 from .projection import COINCIDENT, approach, blend, confine, constrain, correct, curl, part
+from .threads import threads_for
 
 MAX_TRAVEL = 0.4  # smoothing lengths a substep
 MAX_SHIFT = 0.1  # smoothing lengths a projection
 SKIN = 0.1  # smoothing lengths by which neighbour lists reach further, so that they last
-EPSILON_SHARE = 0.1  # of the sum of squared gradients at rest density, in lambda's denominator
+EPSILON_SHARE = 0.1  # of the sum of squared gradients of points at random with rest density, in lambda's denominator
 RELAXATION = 0.75  # of each correction: all particles correct at once and would overshoot
 SPACINGS_PER_LENGTH = 2.2  # smoothing length over particle spacing
 _LARGEST = 1e60  # m, m/s, 1/s: squares and products of what is smaller are finite
@@ -124,12 +126,13 @@ def derive_parameters(
 ) -> FluidParameters:
     """Smoothing length and rest density that fit these particles, whatever their scale.
 
-    The rest density is that of a cubic lattice of the same spacing or, if larger, the median of what these particles
-    have: a cloud as it was given is at rest. Raises BackendError with fewer than two distinct particles.
+    The rest density is that of a cubic lattice of the same spacing or, if larger, the upper quartile of what these
+    particles have: points at random are uneven, and a cloud should not swell because it was drawn at random. Raises
+    BackendError with fewer than two distinct particles.
     """
     spacing = typical_spacing(positions)
     length = SPACINGS_PER_LENGTH * spacing
-    rest_density = max(lattice_density(spacing, length), float(np.median(number_density(positions, length))))
+    rest_density = max(lattice_density(spacing, length), float(np.quantile(number_density(positions, length), 0.75)))
     return FluidParameters(
         smoothing_length=length,
         rest_density=rest_density,
@@ -179,7 +182,8 @@ def number_density(
 ) -> np.ndarray:  # [N] 1/m^3
     """Poly6 number density at each particle, its own share included."""
     solver = _Solver(np.asarray(positions, np.float64) / smoothing_length, np.arange(len(positions)), rest_density=1.0)
-    solver.constrain(pulls=False)
+    with threads_for(len(positions)):
+        solver.constrain(pulls=False)
     return solver.densities / smoothing_length**3
 
 
@@ -191,12 +195,27 @@ def step(
     """The state `dt` seconds later. Raises ValueError if a number is not finite. Equal input, equal bytes."""
     _check(state, dt)
     num = len(state.positions)
-    length = parameters.smoothing_length
     wanted = _wanted_substeps(state, parameters, dt)
     substeps = int(min(wanted, parameters.max_substeps))
     if num == 0:
         return state, StepReport(substeps=1, wanted_substeps=1.0, num_clamped=0, overdensity=0.0, list_builds=0)
-    seconds = dt / substeps
+    with threads_for(num):
+        positions, velocities, num_clamped, solver = _substeps(state, parameters, dt / substeps, substeps)
+    report = StepReport(
+        substeps=substeps,
+        wanted_substeps=wanted,
+        num_clamped=num_clamped,
+        overdensity=solver.overdensity,
+        list_builds=solver.list_builds,
+    )
+    return replace(state, positions=positions, velocities=velocities), report
+
+
+def _substeps(
+    state: FluidState, parameters: FluidParameters, seconds: float, substeps: int
+) -> tuple[np.ndarray, np.ndarray, int, _Solver]:
+    """Positions [N, 3] m and velocities [N, 3] m/s after `substeps` of `seconds` each, and how many were clamped."""
+    num, length = len(state.positions), parameters.smoothing_length
     order = build_grid(state.positions / length, 1.0).order  # neighbours near each other in memory
     solver = _Solver(
         state.positions[order] / length,
@@ -212,14 +231,7 @@ def step(
     positions, velocities = np.empty((num, 3)), np.empty((num, 3))
     positions[order] = solver.positions * length
     velocities[order] = motion * (length / seconds)
-    report = StepReport(
-        substeps=substeps,
-        wanted_substeps=wanted,
-        num_clamped=num_clamped,
-        overdensity=solver.overdensity,
-        list_builds=solver.list_builds,
-    )
-    return replace(state, positions=positions, velocities=velocities), report
+    return positions, velocities, num_clamped, solver
 
 
 def _check(state: FluidState, dt: float) -> None:

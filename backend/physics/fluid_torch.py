@@ -35,10 +35,12 @@ class Pairs:
         return POLY6 * (1.0 - self.squared).clamp(min=0.0) ** 3
 
     @property
+    def spiky_slope(self) -> Tensor:  # [P] 1/h^4, never positive
+        return -SPIKY_SLOPE * (1.0 - self.squared.sqrt()).clamp(min=0.0) ** 2
+
+    @property
     def spiky_gradient(self) -> Tensor:  # [P, 3] 1/h^4, by the position of first
-        distance = self.squared.sqrt()
-        slope = -SPIKY_SLOPE * (1.0 - distance).clamp(min=0.0) ** 2
-        return (slope / distance)[:, None] * self.offsets
+        return (self.spiky_slope / self.squared.sqrt())[:, None] * self.offsets
 
     def total(self, values: Tensor, num: int) -> Tensor:
         """Sums [P, ...] over the neighbours of each of `num` particles."""
@@ -74,7 +76,7 @@ def step_torch(
     length = parameters.smoothing_length
     pull = _vector(parameters.buoyancy, positions) + parameters.drag * _vector(parameters.wind, positions)
     after = (velocities + dt * pull) / (1.0 + parameters.drag * dt)
-    fastest = max((float(v.norm(dim=1).max()) for v in (velocities, after) if len(v)), default=0.0)
+    fastest = max((float(v.detach().norm(dim=1).max()) for v in (velocities, after) if len(v)), default=0.0)
     wanted = math.ceil(fastest * (dt / (MAX_TRAVEL * length)) - 1e-9)
     substeps = min(max(1, wanted), parameters.max_substeps)
     seconds = dt / substeps
@@ -103,7 +105,7 @@ def _substep(x: Tensor, u: Tensor, ids: Tensor, parameters: FluidParameters, sec
         gradients = pairs.spiky_gradient / rest_density
         excess = _density(pairs, len(x)) / rest_density - 1.0
         own_gradient = pairs.total(gradients, len(x))
-        squares = (own_gradient**2).sum(dim=1) + pairs.total((gradients**2).sum(dim=1), len(x))
+        squares = (own_gradient**2).sum(dim=1) + pairs.total((pairs.spiky_slope / rest_density) ** 2, len(x))
         active = excess if parameters.pulls_when_sparse else excess.clamp(min=0.0)
         lambdas = -active / (squares + EPSILON_SHARE * squares_at_rest)
         if iteration == 0:
@@ -111,8 +113,8 @@ def _substep(x: Tensor, u: Tensor, ids: Tensor, parameters: FluidParameters, sec
         shifts, impulses = _corrections(pairs, gradients, lambdas, shares, parameters, squares_at_rest)
         total = total + impulses
         x = _pushed_out(x + shifts, parameters)
-    squared = float((total**2).sum())
-    kept = min(1.0, max(0.0, -2.0 * float((u * total).sum()) / squared)) if squared > 0.0 else 0.0
+    squared = float((total.detach() ** 2).sum())
+    kept = min(1.0, max(0.0, -2.0 * float((u * total).detach().sum()) / squared)) if squared > 0.0 else 0.0
     u = _stirred(x, u + kept * total, parameters, seconds)
     return x, _deflected(x, u, parameters)
 
@@ -155,12 +157,12 @@ def _corrections(
     impulse = (moving[pairs.first] + moving[pairs.second])[:, None] * gradients
     shifts, impulses = pairs.total(pressure, num), pairs.total(impulse, num)
     lengths = RELAXATION * shifts.norm(dim=1)
-    largest = float(lengths.max()) if num else 0.0
+    largest = float(lengths.detach().max()) if num else 0.0
     if largest > MAX_SHIFT:
         factors = MAX_SHIFT / lengths.clamp(min=MAX_SHIFT)
         limit = torch.minimum(factors[pairs.first], factors[pairs.second])[:, None]
         shifts, impulses = pairs.total(limit * pressure, num), pairs.total(limit * impulse, num)
-        largest = RELAXATION * float(shifts.norm(dim=1).max())
+        largest = RELAXATION * float(shifts.detach().norm(dim=1).max())
     scale = RELAXATION * min(1.0, MAX_SHIFT / max(largest, 1e-300))
     return scale * shifts, scale * impulses
 

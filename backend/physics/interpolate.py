@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from .fluid import FluidState
 from .neighbours import MAX_RANGES, build_grid, candidate_ranges
+from .threads import threads_for
 
 SPARSE = 0.05  # weight below which the nearest particles begin to have a say; 1: a particle in the very place
 _NEAREST = 8
@@ -55,10 +56,11 @@ def _kernel_sums(
     grid = build_grid(positions, smoothing_length, reach=float(np.abs(points).max(initial=0.0)))
     sums, weights = np.zeros((len(points), values.shape[1])), np.zeros(len(points))
     num_tasks = max(1, min(256, len(points) // 64))
-    _average(
-        points, grid.cell_size, grid.shape, grid.starts, grid.order, grid.coordinates, values, smoothing_length, num_tasks,
-        sums, weights,
-    )  # fmt: skip
+    with threads_for(len(points)):
+        _average(
+            points, grid.cell_size, grid.shape, grid.starts, grid.order, grid.coordinates, values, smoothing_length,
+            num_tasks, sums, weights,
+        )  # fmt: skip
     return sums, weights
 
 
