@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from backend.contract.job import ExtractionConfig
 from backend.io.images import read_image
 

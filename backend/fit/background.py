@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from backend.contract.job import ExtractionConfig
 from backend.fit.clean_plate import CleanPlate, fill_smoothly, frame_noise, temporal_plate
 from backend.fit.matting import SmokeColor, estimate_smoke_color

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
+from backend.fit.connected import components
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 _MODE_SHARE = 0.25  # of the frames that must agree: smoke may cover a pixel three quarters of the time
@@ -15,6 +17,10 @@ _FEW_SHARE = 0.1  # of the frames: as many must agree where the others are known
 _LIKE_SMOKE = 0.08  # sRGB code, every channel: the shading of opaque smoke
 _MIN_NOISE = 0.5 / 255  # sRGB code; half a step of 8 bits
 _MAX_SPREAD = 4.0  # noise levels; frames that agree less than this show no background
+_MIN_STEP = 1.0 / 255  # sRGB code; codecs move a still pixel by as much when smoke passes beside it
+_STANDS_OUT = 0.7  # of the values around a background lie close to it; shades of lasting smoke follow each other evenly
+_BREADTH = 0.01  # of the longest side
+_CALM = 0.1  # share of the frames that differ from the plate
 _BAND_VALUES = 8_000_000  # temporal statistics are taken over bands of rows of this size
 
 
@@ -47,13 +53,33 @@ def temporal_plate(samples: Sequence[np.ndarray], *, smoke: np.ndarray | None = 
     bands = (np.stack([c[top : top + rows] for c in coded]) for top in range(0, height, rows))
     parts = [_band(band, noise, smoke_coded) for band in bands]
     color, is_seen, activity = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    is_seen = _connected_with_calm(is_seen, activity)
     color = fill_smoothly(color, is_seen)
     return CleanPlate(color=srgb_to_linear(color).astype(np.float32), is_seen=is_seen, noise=noise, activity=activity)
 
 
+def _connected_with_calm(is_seen: np.ndarray, activity: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the seen pixels without islands and threads amid smoke that by chance repeats.
+
+    A region of background has breadth, and somewhere a part that smoke seldom covers.
+    """
+    size = 2 * max(1, round(_BREADTH * max(is_seen.shape))) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    is_calm = is_seen & (activity < _CALM)
+    is_broad = cv2.morphologyEx(is_seen.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    num, labels = components(is_broad)
+    calm = np.bincount(labels[is_calm], minlength=num) > 0.1 * np.bincount(labels.ravel(), minlength=num)
+    calm[0] = False
+    return is_seen & calm[labels]
+
+
 def frame_noise(coded: Sequence[np.ndarray]) -> float:
-    """Noise of one frame [h, w, 3], sRGB code: from differences of frames in time, of which most pixels show no smoke."""
-    spreads = [np.nanmedian(np.abs(b - a)) / (0.6745 * np.sqrt(2.0)) for a, b in itertools.pairwise(coded)]
+    """Noise of one frame [h, w, 3], sRGB code: from differences of frames in time.
+
+    The calmest quarter of the pixels tells it, because smoke may cover the others: a quarter of normally distributed
+    values lies within 0.3186 of their deviation, and a difference of two has sqrt(2) of it.
+    """
+    spreads = [np.nanpercentile(np.abs(b - a), 25) / (0.3186 * np.sqrt(2.0)) for a, b in itertools.pairwise(coded)]
     return max(float(np.median(spreads)), _MIN_NOISE)
 
 
@@ -74,7 +100,11 @@ def _band(coded: np.ndarray, noise: float, smoke: np.ndarray | None) -> tuple[np
     agrees = np.abs(luma - centre) < 0.5 * np.minimum(spread, 1.0) + 2.0 * noise
     weight = agrees[..., None].astype(np.float32)
     color = np.where(weight > 0, coded, 0.0).sum(axis=0) / np.maximum(weight.sum(axis=0), 1.0)
-    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise) & ~is_smoke
+    distance = np.abs(luma - centre)
+    unit = max(noise, _MIN_STEP)
+    num_near = (distance < 3.0 * unit).sum(axis=0)
+    stands_out = num_near > _STANDS_OUT * (distance < 9.0 * unit).sum(axis=0)
+    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise) & stands_out & ~is_smoke
     differs = np.abs(coded - color).max(axis=-1) > 5.0 * noise
     activity = differs.sum(axis=0) / np.maximum(num, 1)
     return color.astype(np.float32), is_seen, activity.astype(np.float32)

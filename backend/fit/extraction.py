@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from backend.contract.errors import BackendError
 from backend.contract.job import ExtractionConfig
 from backend.fit import matte, on_black

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from backend.contract.job import ExtractionConfig
 from backend.fit import matting
 from backend.fit.artist_masks import ArtistMasks

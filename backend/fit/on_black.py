@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from backend.fit.connected import components
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 

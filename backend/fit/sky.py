@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from backend.fit.clean_plate import shortest_interval
-from backend.io.images import linear_to_srgb
 from scipy.interpolate import BSpline
 from scipy.ndimage import convolve1d, grey_opening
+
+from backend.fit.clean_plate import shortest_interval
+from backend.io.images import linear_to_srgb
 
 MIN_SKY_SHARE = 0.1  # of the picture; less is no sky to speak of
 _FIT_SIDE = 192  # px: a gradient needs no more

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from backend.io.images import LUMINANCE, linear_to_srgb
 
 MAX_TRACKS = 400
@@ -15,6 +16,7 @@ STILL_SHARE = 0.0025  # of the longest side: a camera on a tripod in wind
 _LOST_SHARE = 0.4  # of the tracks gone: take new ones
 _INLIER_PX = 1.5
 _MIN_CORNER = 1e-6  # smallest eigenvalue of the structure tensor, of sRGB code 0..1: about one step of 8 bits a pixel
+_MAX_BLACK = 14  # of 255; on black there is nothing but the coding noise around the smoke
 _SMOKE_OPACITY = 0.02  # from here on a pixel is smoke and tells nothing about the camera
 _PARALLAX_SHARE = 0.0015  # of the longest side: beyond it no single homography holds the background
 
@@ -143,6 +145,7 @@ def _corners(gray: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     One vote a cell, so that contrasty smoke does not outvote a faint background.
     """
     quality = cv2.cornerMinEigenVal(cv2.GaussianBlur(gray, (0, 0), 0.8).astype(np.float32) / 255.0, 5)
+    quality = np.where(cv2.blur(gray, (5, 5)) > _MAX_BLACK, quality, 0.0)
     if mask is not None:
         quality = np.where(mask, quality, 0.0)
     edge = 5

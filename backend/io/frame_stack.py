@@ -24,7 +24,7 @@ class FrameStackWriter:
         self.shape = shape
         self.num_written = 0
         self._data = group.create_dataset(
-            name, (num_frames, *shape), np.uint16, chunks=(1, *shape), compression="gzip", compression_opts=1, shuffle=True
+            name, (num_frames, *shape), np.uint16, chunks=(1, *shape), compression="lzf", shuffle=True
         )
 
     def append(self, frame: np.ndarray) -> None:

@@ -6,8 +6,8 @@ import contextlib
 import struct
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 

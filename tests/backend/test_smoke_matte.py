@@ -9,8 +9,7 @@ import pytest
 
 from backend.contract.errors import BackendError
 from backend.contract.job import ExtractionConfig, FramesConfig
-from backend.fit import clean_plate, matting, sky, stabilise
-from backend.io.images import encode_srgb, write_png
+from backend.io.images import encode_srgb, srgb_to_linear, write_png
 from backend.io.video import open_clip
 from backend.reporting import SilentReport
 from backend.stages import frames as frames_stage
@@ -101,3 +100,101 @@ def test_still_camera_opacity_is_near_the_truth(filmed) -> None:
     print(f"mean opacity error inside {np.mean(inside):.4f}, outside {np.mean(outside):.4f}")
     assert np.mean(inside) < 0.05
     assert np.mean(outside) < 0.01
+
+
+def test_layer_over_the_plate_gives_the_frame_back(filmed) -> None:
+    frames, _, _ = filmed
+    layer = smoke_stage.run(frames, ExtractionConfig(), SilentReport(), has_alpha=False)
+    for image, frame in zip(layer.frames, frames, strict=True):
+        again = layer.plate * (1 - image[..., 3:]) + image[..., :3]
+        assert np.abs(again - frame[..., :3]).mean() < 0.01
+        assert (image[..., :3][image[..., 3] == 0.0] == 0.0).all()
+        assert image.dtype == np.float32 and (image[..., 3] >= 0).all() and (image[..., 3] <= 1).all()
+
+
+def test_given_plate_and_masks_have_the_last_word(filmed, tmp_path) -> None:
+    frames, truth, plate = filmed
+    write_png(tmp_path / "plate.png", plate, bit_depth=16)
+    matte = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    matte[:, : WIDTH // 2] = 0.0
+    write_png(tmp_path / "matte.png", matte)
+    config = ExtractionConfig(clean_plate=str(tmp_path / "plate.png"), garbage_matte=str(tmp_path / "matte.png"))
+    layer = smoke_stage.run(frames, config, SilentReport(), has_alpha=False)
+    assert np.abs(layer.plate - plate).max() < 1e-3
+    errors = []
+    for image, opacity in zip(layer.frames, truth, strict=True):
+        assert (image[:, : WIDTH // 2] == 0.0).all()
+        right = opacity[:, WIDTH // 2 :]
+        errors.append(np.abs(image[:, WIDTH // 2 :, 3] - right)[right > 0.02].mean())
+    assert np.mean(errors) < 0.06
+
+
+def test_smoke_mask_keeps_what_would_be_dropped(filmed, tmp_path) -> None:
+    frames, _, plate = filmed
+    write_png(tmp_path / "plate.png", plate, bit_depth=16)
+    write_png(tmp_path / "mask.png", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    with_mask = ExtractionConfig(clean_plate=str(tmp_path / "plate.png"), smoke_mask=str(tmp_path / "mask.png"))
+    without = ExtractionConfig(clean_plate=str(tmp_path / "plate.png"))
+    sums = [
+        sum(f[..., 3].sum() for f in smoke_stage.run(frames[:6], c, SilentReport(), has_alpha=False).frames)
+        for c in (with_mask, without)
+    ]
+    assert sums[0] > sums[1]
+
+
+def test_scene_without_smoke_is_refused(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    plate = encode_srgb(textured_plate()).astype(int)
+    write_h264(tmp_path / "a.mp4", [np.clip(plate + rng.normal(0, 3, plate.shape), 0, 255).astype(np.uint8) for _ in range(16)])
+    with pytest.raises(BackendError) as caught:
+        smoke_stage.run(read_frames(tmp_path / "a.mp4"), ExtractionConfig(), SilentReport(), has_alpha=False)
+    assert caught.value.code == "no_smoke"
+
+
+def test_passing_car_and_shaking_tree_are_no_smoke() -> None:
+    """A red box crosses the picture, a textured patch sways: neither is a mixture of the background and one grey."""
+    rng = np.random.default_rng(2)
+    plate = textured_plate()
+    tree = (rng.random((40, 40, 3)) * [0.2, 0.5, 0.1]).astype(np.float32)
+    clip = []
+    for k in range(30):
+        image = plate.copy()
+        shift = round(3 * np.sin(k))
+        image[20:60, 60 + shift : 100 + shift] = tree
+        image[110:125, 8 * k : 8 * k + 24] = [0.5, 0.03, 0.02]
+        clip.append(np.concatenate([image, np.ones((HEIGHT, WIDTH, 1), np.float32)], axis=2))
+    with pytest.raises(BackendError) as caught:
+        smoke_stage.run(clip, ExtractionConfig(), SilentReport(), has_alpha=False)
+    assert caught.value.code == "no_smoke"
+
+
+def test_turning_camera_is_stabilised() -> None:
+    """A camera that pans over a wide plate sees the same background again; opacity is still found."""
+    wide = cv2.resize(textured_plate(3), (2 * WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    rng = np.random.default_rng(0)
+    wide = np.clip(wide + 0.15 * cv2.GaussianBlur(rng.normal(0, 1, wide.shape).astype(np.float32), (0, 0), 1.5), 0.01, 1)
+    clip, truth = [], []
+    for k in range(30):
+        offset = 60 + round(25 * np.sin(k / 6))
+        opacity = np.roll(plume_opacity(k), 60 - offset, axis=1)
+        image = composite(wide[:, offset : offset + WIDTH], opacity, k)
+        clip.append(np.concatenate([image, np.ones((HEIGHT, WIDTH, 1), np.float32)], axis=2))
+        truth.append(opacity)
+    layer = smoke_stage.run(clip, ExtractionConfig(), SilentReport(), has_alpha=False)
+    assert "turns" in layer.reason
+    pairs = list(zip(layer.frames, truth, strict=True))
+    assert np.mean([np.abs(i[..., 3] - t)[t > 0.02].mean() for i, t in pairs]) < 0.12
+    assert np.mean([i[..., 3][t == 0].mean() for i, t in pairs]) < 0.02
+
+
+def test_plume_that_never_clears() -> None:
+    """The background in the middle is never seen; the fill from around it must not be smoke."""
+    plate, clip, truth = textured_plate(), [], []
+    for k in range(NUM):
+        truth.append(plume_opacity(k, cover=1.0))
+        image = encode_srgb(composite(plate, truth[-1], k)).astype(np.float32) / 255.0
+        clip.append(np.concatenate([srgb_to_linear(image), np.ones((HEIGHT, WIDTH, 1))], axis=2).astype(np.float32))
+    layer = smoke_stage.run(clip, ExtractionConfig(), SilentReport(), has_alpha=False)
+    pairs = list(zip(layer.frames, truth, strict=True))
+    assert np.mean([np.abs(i[..., 3] - t)[t > 0.02].mean() for i, t in pairs]) < 0.1
+    assert np.mean([i[..., 3][t == 0].mean() for i, t in pairs]) < 0.01

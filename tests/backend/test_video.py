@@ -13,9 +13,9 @@ import pytest
 
 from backend.contract.errors import BackendError
 from backend.contract.job import FramesConfig
+from backend.io import working_frames
 from backend.io.images import encode_srgb
 from backend.io.video import open_clip
-from backend.io import working_frames
 from backend.reporting import SilentReport
 from backend.stages import frames
 
