@@ -254,7 +254,7 @@ class WILDSMOKE_PG_settings(bpy.types.PropertyGroup):
     )
     use_frame_range: BoolProperty(name="Limit Frames", description="Fit only some frames of the clip", default=False)
     frame_start: IntProperty(name="From", description="First frame to fit; the clip's first one is 0", default=0, min=0)
-    frame_stop: IntProperty(name="To, Without", description="First frame that is no longer fitted", default=24, min=1)
+    frame_stop: IntProperty(name="Before", description="First frame that is no longer fitted", default=24, min=1)
     import_when_done: BoolProperty(
         name="Import When Done", description="Bring the smoke into the scene as soon as it is finished", default=True
     )
