@@ -81,6 +81,7 @@ def test_blender_never_freezes(gui, blend, plan):
     gui.start(blend, **plan, steps=["open_sidebar", "use_fake_backend", "fill_in", "start", "wait_end", "shot done", "hold"])
     report = gui.wait_for("holding", seconds=60)
     assert report["phases"][-1] == "done"
+    print(f"longest gap between two ticks of a timer: {report['longest_gap']:.2f} s")  # seen with pytest -rP
     assert report["longest_gap"] < 1.0, report  # redraws in software take most of it
 
 
