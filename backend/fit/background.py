@@ -10,12 +10,15 @@ import numpy as np
 
 from backend.contract.job import ExtractionConfig
 from backend.fit.clean_plate import CleanPlate, fill_smoothly, frame_noise, temporal_plate
+from backend.fit.connected import components
 from backend.fit.matting import SmokeColor, estimate_smoke_color
 from backend.fit.sky import Sky, fit_sky
 from backend.fit.stabilise import ImageMotion, measure_motion, warp
 from backend.io.images import linear_to_srgb, read_linear, srgb_to_linear
 
 MAX_MOTION_SAMPLES = 120
+_RESTLESS, _RESTLESS_SHARE = 0.2, 0.1  # share of the frames in which a pixel differs; share of such pixels
+_MAX_STRANGE = 0.2  # of the calm pixels above the skyline that are no clear sky
 _MEMORY = 256 * 2**20  # bytes of frames that the temporal plate may hold
 _SKY_SPACING = 4  # frames between two fits of the sky of a moving camera
 _MAX_SKY_FITS = 120
@@ -124,6 +127,7 @@ def _over_time(
     smoke = _smoke_before(plate, samples)
     if smoke is not None:
         plate = temporal_plate(samples, smoke=smoke.linear)
+    plate = _with_sky(plate)
     measured |= {
         "plate_seen_share": float(plate.is_seen.mean()),
         "plate_noise": plate.noise,
@@ -134,6 +138,28 @@ def _over_time(
     return Background(
         plate=plate, motion=motion, skies=[], sky_frames=[], noise=plate.noise, is_temporal=True, reason=reason, measured=measured
     )
+
+
+def _with_sky(plate: CleanPlate) -> CleanPlate:
+    """The plate with clear sky in place of smoke that hangs before it all the time.
+
+    What differs from the sky and lies above the skyline is such smoke if part of it changes; towers and clouds that
+    keep still stay in the plate.
+    """
+    sky = fit_sky(plate.color)
+    if sky is None or sky.skyline.max() < 1:
+        return plate
+    is_above = np.arange(len(plate.color))[:, None] < sky.skyline
+    is_strange = is_above & (np.abs(linear_to_srgb(plate.color) - sky.coded).max(axis=2) > max(3.0 * sky.residual, 4.0 / 255))
+    is_calm = is_above & plate.is_seen & (plate.activity < _RESTLESS)
+    if is_strange[is_calm].sum() > _MAX_STRANGE * is_calm.sum():
+        return plate  # what looked like sky at the top is something else
+    num, labels = components(is_strange)
+    restless = np.bincount(labels[(plate.activity > _RESTLESS) | ~plate.is_seen], minlength=num)
+    is_smoke = restless > _RESTLESS_SHARE * np.bincount(labels.ravel(), minlength=num)
+    is_smoke[0] = False
+    clear = srgb_to_linear(np.clip(sky.coded, 0.0, 1.0)).astype(np.float32)
+    return dataclasses.replace(plate, color=np.where(is_smoke[labels][..., None], clear, plate.color))
 
 
 def _smoke_before(plate: CleanPlate, samples: list[np.ndarray]) -> SmokeColor | None:

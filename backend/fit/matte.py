@@ -19,7 +19,7 @@ from backend.io.images import LUMINANCE, linear_to_srgb
 _LOW_NOISES = 3.0  # opacity below this many deviations of noise is none
 _MIN_LOW = 0.03  # opacity: errors of the plate that no noise figure knows
 _HIGH = 0.15  # opacity that a region must reach somewhere
-_MIN_REGION = 3e-4  # of the picture; smaller regions are specks
+_MIN_REGION = 6e-4  # of the picture; smaller regions are specks
 _MIN_EXPLAINED = 0.55  # of the change over time in a neighbourhood: trees and cars brighten and darken at random
 _MIN_DWELL = 0.12  # mean opacity over time that a region must reach somewhere: a car passes, a plume stays
 _REACH = 0.03  # of the longest side: smoke may be this far from where the samples showed it

@@ -6,14 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
+from backend.contract.job import ExtractionConfig
 from backend.fit import clean_plate, matting, sky, stabilise
+from backend.reporting import SilentReport
+from backend.stages import smoke
 
 
 def test_opacity_by_hand() -> None:
     """J 0.1, S 0.6 grey, a 0.4: I = 0.1 * 0.6 + 0.6 * 0.4 = 0.3; with a known colour a = (J - I) / (J - S) = 0.4."""
-    smoke = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.6, spread=1e-3)
+    color = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.6, spread=1e-3)
     image, background = np.full((1, 1, 3), 0.3, np.float32), np.full((1, 1, 3), 0.1, np.float32)
-    found = matting.solve_opacity(image, background, smoke, 0.5 / 255)
+    found = matting.solve_opacity(image, background, color, 0.5 / 255)
     assert found.value[0, 0] == pytest.approx(0.4, abs=0.01)
     assert found.explained[0, 0] > 0.99
 
@@ -23,17 +26,17 @@ def test_brightness_of_smoke_is_free_before_a_coloured_background(brightness) ->
     """Before blue sky the blue that is left tells the opacity, whether the smoke is lit or shaded."""
     background = np.full((1, 1, 3), [0.1, 0.3, 0.8], np.float32)
     image = 0.5 * background + 0.5 * brightness
-    smoke = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.5, spread=0.3)
-    assert matting.solve_opacity(image, background, smoke, 0.5 / 255).value[0, 0] == pytest.approx(0.5, abs=0.03)
+    color = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.5, spread=0.3)
+    assert matting.solve_opacity(image, background, color, 0.5 / 255).value[0, 0] == pytest.approx(0.5, abs=0.03)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-12, 0.5, 1.0, 1e6])
 def test_opacity_stays_finite(value) -> None:
     """Also where image, background and smoke are alike, black or far too bright."""
-    smoke = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.5, spread=0.1)
+    color = matting.SmokeColor(direction=np.ones(3, np.float32), brightness=0.5, spread=0.1)
     for background in (0.0, 0.5, value):
         images = [np.full((2, 2, 3), v, np.float32) for v in (value, background)]
-        found = matting.solve_opacity(*images, smoke, 0.5 / 255)
+        found = matting.solve_opacity(*images, color, 0.5 / 255)
         for array in (found.value, found.deviation, found.explained):
             assert np.isfinite(array).all() and (array >= 0).all()
         if value == background:
@@ -102,18 +105,35 @@ def test_fill_is_smooth_exact_outside_and_bounded() -> None:
     assert (clean_plate.fill_smoothly(image, np.zeros_like(known)) == image).all()
 
 
-def make_sky(num_columns: int = 160, num_rows: int = 90) -> np.ndarray:
-    """[h, w, 3] linear: blue above, hazy below, a hill with texture, and grey smoke that stands on the horizon."""
+def sky_opacity() -> np.ndarray:
+    """[h, w] 0..0.9: smoke that stands on the horizon."""
+    rows, columns = np.mgrid[0:90, 0:160]
+    return 0.9 * np.exp(-(((columns - 80) / 14) ** 2) - ((rows - 42) / 14) ** 2)
+
+
+def make_sky(phase: float = 0.0) -> np.ndarray:
+    """[h, w, 3] linear: blue above, hazy below, a hill with texture, and grey smoke whose billows move with phase."""
     rng = np.random.default_rng(0)
-    y = np.linspace(0, 1, num_rows)[:, None, None]
-    sky = np.array([0.05, 0.16, 0.45]) * (1 - y) + np.array([0.35, 0.4, 0.5]) * y
-    image = np.repeat(sky, num_columns, axis=1)
-    rows, columns = np.mgrid[0:num_rows, 0:num_columns]
-    opacity = 0.9 * np.exp(-(((columns - 80) / 14) ** 2) - ((rows - 42) / 14) ** 2)
-    image = image * (1 - opacity[..., None]) + 0.6 * (1 + 0.2 * np.sin(columns / 3.0))[..., None] * opacity[..., None]
+    y = np.linspace(0, 1, 90)[:, None, None]
+    sky_color = np.array([0.05, 0.16, 0.45]) * (1 - y) + np.array([0.35, 0.4, 0.5]) * y
+    image = np.repeat(sky_color, 160, axis=1)
+    rows, columns = np.mgrid[0:90, 0:160]
+    light = 0.6 * (1 + 0.2 * np.sin(columns / 3.0 + phase) * np.cos(rows / 4.0 + 0.6 * phase))
+    image = image * (1 - sky_opacity()[..., None]) + (light * sky_opacity())[..., None]
     ground = rows > 60 - 6 * np.sin(columns / 30)
-    texture = np.array([0.25, 0.17, 0.09]) * (0.6 + 0.8 * rng.random((num_rows, num_columns, 1)))
+    texture = np.array([0.25, 0.17, 0.09]) * (0.6 + 0.8 * rng.random((90, 160, 1)))
     return np.where(ground[..., None], texture, image).astype(np.float32)
+
+
+def test_lasting_smoke_before_the_sky_of_a_still_camera() -> None:
+    """Nothing behind the smoke is ever seen, and its outline never moves: the sky beside it tells what is behind."""
+    clip = [np.concatenate([make_sky(0.4 * k), np.ones((90, 160, 1))], axis=2).astype(np.float32) for k in range(24)]
+    layer = smoke.run(clip, ExtractionConfig(), SilentReport(), has_alpha=False)
+    opacity = sky_opacity() * (np.mgrid[0:90, 0:160][0] < 50)
+    for image in layer.frames:
+        error = np.abs(image[..., 3] - opacity)[:50]
+        assert error[opacity[:50] > 0.05].mean() < 0.12
+        assert image[70:, :, 3].max() == 0.0
 
 
 def test_sky_is_found_behind_the_smoke() -> None:
