@@ -58,7 +58,9 @@ class FluidParameters:
     """How the fluid behaves.
 
     smoothing_length: m. rest_density: particles/m^3 beyond which they push each other apart. buoyancy: m/s^2, a vector.
-    wind: velocity of the surrounding air, m/s. drag: towards the wind, 1/s. solver_iterations: projections a substep.
+    wind: velocity of the surrounding air, m/s. drag: towards the wind, 1/s. surface_drag: the same where the smoke
+    borders on air, in proportion to 1 - rho / rho_0 (Macklin 2014 eq. 30), 1/s; shears the edge, so that it rolls up.
+    solver_iterations: projections a substep.
     max_substeps: a step. tensile_strength: of the artificial pressure that keeps particles from clumping, relative to
     the pressure of an over-density of one; tensile_exponent: how suddenly it sets in. viscosity: how fast neighbours'
     velocities become equal (XSPH), 1/s. vorticity_confinement: how fast it spins eddies up, 1/s.
@@ -70,6 +72,7 @@ class FluidParameters:
     buoyancy: Vector = (0.0, 0.0, 0.0)
     wind: Vector = (0.0, 0.0, 0.0)
     drag: float = 0.0
+    surface_drag: float = 0.0
     solver_iterations: int = 3
     max_substeps: int = 4
     tensile_strength: float = 0.01
@@ -85,7 +88,7 @@ class FluidParameters:
                 raise ValueError(f"{name} = {getattr(self, name)!r} is not positive")
         if not 1.0 / _LARGEST <= self.rest_density * self.smoothing_length**3 <= _LARGEST:
             raise ValueError(f"rest_density = {self.rest_density!r} does not fit the smoothing length")
-        for name in ("drag", "tensile_strength", "viscosity", "vorticity_confinement"):
+        for name in ("drag", "surface_drag", "tensile_strength", "viscosity", "vorticity_confinement"):
             if not 0.0 <= getattr(self, name) <= _LARGEST:
                 raise ValueError(f"{name} = {getattr(self, name)!r} is negative or not finite")
         for name in ("buoyancy", "wind"):
@@ -383,19 +386,24 @@ class _Solver:
         return motion
 
     def _stirred(self, motion: np.ndarray, parameters: FluidParameters, seconds: float) -> np.ndarray:
-        """Viscosity and vorticity confinement, where wanted."""
-        if parameters.viscosity == 0.0 and parameters.vorticity_confinement == 0.0:
+        """Drag at the surface, viscosity and vorticity confinement, where wanted."""
+        if max(parameters.surface_drag, parameters.viscosity, parameters.vorticity_confinement) == 0.0:
             return motion
         self.constrain(pulls=False)
-        shared = (self.positions, motion, *self.lists(), self.densities)
+        if parameters.surface_drag > 0.0:
+            exposed = np.maximum(1.0 - self.densities / self.rest_density, 0.0)
+            drag = (parameters.surface_drag * seconds * exposed)[:, None]
+            air = np.array(parameters.wind) * (seconds / parameters.smoothing_length)
+            motion = (motion + drag * air) / (1.0 + drag)
+        shared = (*self.lists(), self.densities)
         if parameters.viscosity > 0.0:
             result = np.empty_like(motion)
-            blend(*shared, -math.expm1(-parameters.viscosity * seconds), result)
+            blend(self.positions, motion, *shared, -math.expm1(-parameters.viscosity * seconds), result)
             motion = result
         if parameters.vorticity_confinement > 0.0:
             curls, pushes = np.empty_like(motion), np.empty_like(motion)
-            curl(self.positions, motion, *shared[2:], curls)
-            confine(self.positions, *shared[2:], curls, pushes)
+            curl(self.positions, motion, *shared, curls)
+            confine(self.positions, *shared, curls, pushes)
             motion = motion + min(parameters.vorticity_confinement * seconds, 1.0) * pushes
         return motion
 

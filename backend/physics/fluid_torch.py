@@ -168,9 +168,13 @@ def _corrections(
 
 
 def _stirred(x: Tensor, u: Tensor, parameters: FluidParameters, seconds: float) -> Tensor:
-    """Viscosity and vorticity confinement."""
+    """Drag at the surface, viscosity and vorticity confinement."""
     pairs, num = find_pairs(x), len(x)
     density = _density(pairs, num)
+    if parameters.surface_drag > 0.0:
+        exposed = (1.0 - density / (parameters.rest_density * parameters.smoothing_length**3)).clamp(min=0.0)
+        drag = (parameters.surface_drag * seconds * exposed)[:, None]
+        u = (u + drag * _vector(parameters.wind, x) * (seconds / parameters.smoothing_length)) / (1.0 + drag)
     if parameters.viscosity > 0.0:
         weights = pairs.poly6 / torch.maximum(density[pairs.first], density[pairs.second])
         relative = u[pairs.second] - u[pairs.first]

@@ -63,6 +63,18 @@ def test_drag_leads_to_the_wind():
     np.testing.assert_allclose(after.velocities, [[0.3, 0.0, -0.1]], rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.parametrize("drag", [3.0, 1e30])
+def test_surface_drag_by_hand(drag):
+    """A lone particle has rho = W(0); at half the rest density it feels half the drag. Inside dense smoke there is none."""
+    parameters = FluidParameters(smoothing_length=1.0, rest_density=2.0 * POLY6, surface_drag=drag, wind=(0.2, 0.0, 0.0))
+    after, _ = step(state_of([[0.0, 0.0, 0.0]], [[0.0, 0.1, 0.0]]), parameters, 0.5)
+    slowed = 1.0 + 0.5 * 0.5 * drag
+    np.testing.assert_allclose(after.velocities, [[0.2 * (1.0 - 1.0 / slowed), 0.1 / slowed, 0.0]], atol=1e-15)
+    dense = replace(parameters, rest_density=0.5 * POLY6, tensile_strength=0.0)
+    after, _ = step(state_of([[0.0, 0.0, 0.0]], [[0.0, 0.1, 0.0]]), dense, 0.5)
+    np.testing.assert_allclose(after.velocities, [[0.0, 0.1, 0.0]], atol=1e-15)
+
+
 def test_substeps_and_limit_are_reported():
     parameters = FluidParameters(smoothing_length=1.0, rest_density=1.0, max_substeps=4)
     for speed, substeps, is_limited in [(0.4, 1, False), (0.41, 2, False), (1.6, 4, False), (1.7, 4, True)]:
@@ -312,7 +324,7 @@ def test_nothing_becomes_nan(exponents, seed, pulls):
     state = replace(state, positions=np.concatenate([state.positions[:20], state.positions[:20]]) + offset)
     parameters = FluidParameters(
         smoothing_length=0.3, rest_density=200.0, buoyancy=(1e4, 0.0, 1e4), drag=drag, viscosity=drag,
-        vorticity_confinement=drag, pulls_when_sparse=pulls, tensile_strength=0.1,
+        vorticity_confinement=drag, surface_drag=drag, pulls_when_sparse=pulls, tensile_strength=0.1,
     )  # fmt: skip
     for _ in range(3):
         state, report = step(state, parameters, dt)
@@ -342,7 +354,7 @@ def test_bad_time_is_refused(dt):
     [
         {"smoothing_length": 0.0}, {"smoothing_length": np.nan}, {"rest_density": -1.0}, {"drag": -1.0}, {"drag": np.inf},
         {"buoyancy": (0.0, np.nan, 0.0)}, {"wind": (0.0, 0.0)}, {"max_substeps": 0}, {"solver_iterations": -1},
-        {"tensile_exponent": 16}, {"viscosity": -0.1},
+        {"tensile_exponent": 16}, {"viscosity": -0.1}, {"surface_drag": -1.0},
     ],
 )  # fmt: skip
 def test_bad_parameters_are_refused(bad):

@@ -20,6 +20,7 @@ SOLIDS = (
 OPTIONS = {
     "plain": {},
     "forces": {"buoyancy": (0.1, 0.2, 1.0), "wind": (1.0, 0.0, 0.0), "drag": 0.7},
+    "surface": {"surface_drag": 4.0, "wind": (1.0, 0.0, 0.0)},
     "viscosity": {"viscosity": 3.0},
     "vorticity": {"vorticity_confinement": 2.0},
     "liquid": {"pulls_when_sparse": True},
