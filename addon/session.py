@@ -22,7 +22,7 @@ from .supervisor import Supervisor
 ROOT = Path(__file__).resolve().parents[1]  # holds backend/
 PACKAGE = __package__.rpartition(".")[0]
 TICK_SECONDS = 0.1
-_REDRAWN_AREAS = ("VIEW_3D", "PREFERENCES")
+_REDRAWN_REGIONS = (("VIEW_3D", "UI"), ("PREFERENCES", "WINDOW"))  # not the viewport itself: a heavy scene takes its time
 
 
 class Session:
@@ -106,22 +106,27 @@ def start_ticking() -> None:
 
 
 def tick() -> float | None:
-    """Of the timer: take in events, import what is finished, redraw. None ends the timer."""
+    """Of the timer: take in events, import what is finished, redraw what changed. None ends the timer."""
+    shown = current.supervisor.shown()
     current.supervisor.tick()
+    has_news = current.supervisor.shown() != shown
     if current.check is not None and (finding := current.check.poll()) is not None:
         current.finding, current.check = finding, None
+        has_news = True
     for folder in current.supervisor.take_finished():
         # apart, so that a defect in the import cannot stop this timer
         bpy.app.timers.register(lambda folder=folder: import_finished(folder), first_interval=0.0)
-    redraw()
+    if has_news:
+        redraw()
     return TICK_SECONDS if current.supervisor.needs_ticks or current.check is not None else None
 
 
 def redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in _REDRAWN_AREAS:
-                area.tag_redraw()
+            for region in area.regions:
+                if (area.type, region.type) in _REDRAWN_REGIONS:
+                    region.tag_redraw()
 
 
 def import_finished(folder: Path) -> None:

@@ -50,6 +50,10 @@ class Supervisor:
     def log_lines(self, folder: Path | None) -> list[str]:
         return self._logs.get(folder, []) if folder else []
 
+    def shown(self) -> tuple[dict[Path, JobStatus], dict[Path, list[str]]]:
+        """All that a panel may show, to compare with what it was."""
+        return dict(self._statuses), dict(self._logs)
+
     def look(self, folder: Path) -> JobStatus:
         """See what a job folder holds. What our own run says of its folder is better, and stays."""
         if folder != self.running_folder:

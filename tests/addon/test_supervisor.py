@@ -38,6 +38,17 @@ def test_a_run_from_start_to_import(supervisor, fake_backend, tmp_path):
     assert supervisor.take_finished() == [tmp_path] and supervisor.take_finished() == []
 
 
+def test_what_is_shown_changes_only_with_news(supervisor, fake_backend, tmp_path):
+    supervisor.start(fake_backend, tmp_path, Job(video="hang.mp4"))
+    tick_until(supervisor, lambda: supervisor.status(tmp_path).device == "cpu" and supervisor.log_lines(tmp_path))
+    before = supervisor.shown()
+    for _ in range(5):
+        supervisor.tick()
+    assert supervisor.shown() == before
+    supervisor.cancel()
+    assert supervisor.shown() != before
+
+
 def test_only_one_run_at_a_time(supervisor, fake_backend, tmp_path):
     supervisor.start(fake_backend, tmp_path / "a", Job(video="slow.mp4"))
     with pytest.raises(BackendError) as caught:

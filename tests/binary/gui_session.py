@@ -16,7 +16,7 @@ import bpy
 
 MODULE = "bl_ext.user_default.wildsmoke"
 PLAN = json.loads(Path(os.environ["WILDSMOKE_GUI_PLAN"]).read_text())
-REPORT: dict = {"phases": [], "longest_gap": 0.0}
+REPORT: dict = {"phases": [], "gaps": {}}
 STATE: dict = {"began": time.monotonic(), "last": None, "steps": list(PLAN["steps"])}
 
 
@@ -63,6 +63,28 @@ def shot(name: str) -> bool:
         STATE[f"asked {name}"] = True
         path.touch()
     return not path.exists()
+
+
+def measure_ticks() -> bool:
+    """From now on note the most that one tick of the add-on's timer keeps Blender's main thread busy."""
+    REPORT["tick_seconds"] = 0.0
+    real_tick = session().tick
+
+    def timed_tick() -> float | None:
+        began = time.thread_time()
+        try:
+            return real_tick()
+        finally:
+            REPORT["tick_seconds"] = max(REPORT["tick_seconds"], time.thread_time() - began)
+
+    session().tick = timed_tick
+    return True
+
+
+def rest() -> bool:
+    """Three seconds of nothing, to compare with."""
+    STATE.setdefault("rest", time.monotonic())
+    return time.monotonic() - STATE["rest"] > 3.0
 
 
 def open_sidebar() -> bool:
@@ -179,7 +201,8 @@ def quit_blender() -> bool:
 def step() -> float | None:
     now = time.monotonic()
     if STATE["last"] is not None:
-        REPORT["longest_gap"] = max(REPORT["longest_gap"], now - STATE["last"])
+        name = STATE["steps"][0] if STATE["steps"] else "after"
+        REPORT["gaps"][name] = max(REPORT["gaps"].get(name, 0.0), now - STATE["last"])
     STATE["last"] = now
     phase = status().phase.value
     if not REPORT["phases"] or REPORT["phases"][-1] != phase:

@@ -78,11 +78,15 @@ def test_a_run_in_the_window(gui, blend, plan):
 
 def test_blender_never_freezes(gui, blend, plan):
     plan["video"] = plan["video"].replace("slow", "flood")
-    gui.start(blend, **plan, steps=["open_sidebar", "use_fake_backend", "fill_in", "start", "wait_end", "shot done", "hold"])
+    steps = ["open_sidebar", "use_fake_backend", "fill_in", "rest", "measure_ticks", "start", "wait_end", "shot done", "hold"]
+    gui.start(blend, **plan, steps=steps)
     report = gui.wait_for("holding", seconds=60)
     assert report["phases"][-1] == "done"
-    print(f"longest gap between two ticks of a timer: {report['longest_gap']:.2f} s")  # seen with pytest -rP
-    assert report["longest_gap"] < 1.0, report  # redraws in software take most of it
+    gaps = report["gaps"]
+    print(f"longest gap between ticks: at rest {gaps['rest']:.2f} s, in a flood {gaps['wait_end']:.2f} s")  # pytest -rP
+    print(f"longest tick: {report['tick_seconds'] * 1000:.1f} ms of the main thread")
+    assert 0.0 < report["tick_seconds"] < 0.1
+    assert gaps["wait_end"] < 2.0 + gaps["rest"], "drawing in software on a busy machine takes most of it"
 
 
 @pytest.mark.parametrize("behaviour", ["error", "half_line", "succeed"])
@@ -116,7 +120,8 @@ def test_the_real_backend_from_clip_to_volume(gui, blend, tmp_path):
     gui.start(blend, **plan, steps=steps)
     report = gui.wait_for("holding", seconds=400)
     assert report["phases"][-1] == "done" and "VOLUME" in report["objects"]
-    assert report["longest_gap"] < 3.0, report  # the import, with the first VDB file read, is the longest
+    assert report["gaps"]["wait_end"] < 2.0, report
+    assert report["gaps"].get("wait_import", 0.0) < 3.0, report  # it reads the first VDB file
 
 
 @pytest.mark.parametrize("how", ["quit", "kill"])
