@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from backend.contract.errors import BackendError
 from backend.contract.job import ExtractionConfig
 from backend.fit.clean_plate import CleanPlate, fill_smoothly, frame_noise, temporal_plate
 from backend.fit.connected import components
@@ -19,9 +20,11 @@ from backend.io.images import linear_to_srgb, read_linear, srgb_to_linear
 MAX_MOTION_SAMPLES = 120
 _RESTLESS, _RESTLESS_SHARE = 0.2, 0.1  # share of the frames in which a pixel differs; share of such pixels
 _MAX_STRANGE = 0.2  # of the calm pixels above the skyline that are no clear sky
+_CLEARANCE = 0.03  # of the height
 _MEMORY = 256 * 2**20  # bytes of frames that the temporal plate may hold
 _SKY_SPACING = 4  # frames between two fits of the sky of a moving camera
 _MAX_SKY_FITS = 120
+_MIN_SEEN = 0.6  # of the background of a camera that turns; less is a camera that travels
 _MIN_SKY_FITS = 0.7  # share of the sampled frames in which a sky must be found
 
 
@@ -66,15 +69,29 @@ class Background:
             return image
         return np.nan_to_num(warp(image[..., None], self.motion.between(index))).reshape(image.shape)
 
-    def _sky_at(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Between the two fits around the frame, in proportion."""
+    def seeds(self, index: int) -> np.ndarray | None:
+        """[h, w] bool: where smoke is recognised; None for everywhere. Close above a skyline the ground may look like it."""
+        if self.plate is not None:
+            return None
+        height = self.skies[0].coded.shape[0]
+        return np.arange(height)[:, None] < self._line_at(index) - _CLEARANCE * height
+
+    def _line_at(self, index: int) -> np.ndarray:
+        """[w] the skyline of a frame."""
+        low, high, t = self._around(index)
+        return (1.0 - t) * self.skies[low].skyline + t * self.skies[high].skyline
+
+    def _around(self, index: int) -> tuple[int, int, float]:
+        """The fits of the sky before and after a frame, and how far it is between them, 0..1."""
         position = float(np.interp(index, self.sky_frames, np.arange(len(self.skies))))
         low = int(position)
-        high, t = min(low + 1, len(self.skies) - 1), position - low
-        a, b = self.skies[low], self.skies[high]
-        coded = (1.0 - t) * a.coded + t * b.coded
-        line = (1.0 - t) * a.skyline + t * b.skyline
-        is_above = np.arange(coded.shape[0])[:, None] + 0.5 < line
+        return low, min(low + 1, len(self.skies) - 1), position - low
+
+    def _sky_at(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Between the two fits around the frame, in proportion."""
+        low, high, t = self._around(index)
+        coded = (1.0 - t) * self.skies[low].coded + t * self.skies[high].coded
+        is_above = np.arange(coded.shape[0])[:, None] + 0.5 < self._line_at(index)
         return srgb_to_linear(np.clip(coded, 0.0, 1.0)).astype(np.float32), is_above
 
 
@@ -103,9 +120,23 @@ def find_background(
             plate=plate, motion=motion, skies=[], sky_frames=[], noise=noise, is_temporal=False,
             reason="The clean plate was given.", measured=measured,
         )  # fmt: skip
-    if motion.is_still or not motion.has_parallax:
+    if motion.is_still:
         return _over_time(frames, numbers, motion, measured, on_step)
-    return _before_sky(frames, motion, measured, on_step)
+    turned = None if motion.has_parallax else _over_time(frames, numbers, motion, measured, on_step)
+    if turned is not None and turned.measured["plate_seen_share"] > _MIN_SEEN:
+        return turned
+    before_sky = _before_sky(frames, motion, measured, on_step)
+    if before_sky is not None:
+        return before_sky
+    if config.garbage_matte or config.smoke_mask:
+        background = turned or _over_time(frames, numbers, motion, measured, on_step)
+        text = "The camera travels and there is no clear sky behind the smoke; the matte is uncertain."
+        return dataclasses.replace(background, warnings=[("matte_uncertain", text)])
+    raise BackendError(
+        "background_unknown",
+        "The camera travels and there is no clear sky behind the smoke, so the background behind it cannot be told.",
+        hint="Give the smoke cut out on black or with alpha, or paint extraction.garbage_matte around it.",
+    )
 
 
 def _over_time(
@@ -170,8 +201,8 @@ def _smoke_before(plate: CleanPlate, samples: list[np.ndarray]) -> SmokeColor | 
 
 def _before_sky(
     frames: Sequence[np.ndarray], motion: ImageMotion, measured: dict[str, float], on_step: Callable[[int, int], None]
-) -> Background:
-    """The sky behind the smoke of a camera that travels."""
+) -> Background | None:
+    """The sky behind the smoke of a camera that travels; None where there is no sky in most frames."""
     num = min(_MAX_SKY_FITS, max(2, -(-len(frames) // _SKY_SPACING)))
     numbers = np.unique(np.linspace(0, len(frames) - 1, num).round().astype(int)).tolist()
     skies, found = [], []
@@ -183,12 +214,10 @@ def _before_sky(
         on_step(step, len(numbers))
     measured["sky_found_share"] = len(found) / len(numbers)
     if len(found) < _MIN_SKY_FITS * len(numbers):
-        background = _over_time(frames, numbers, motion, measured, on_step)
-        text = "The camera travels and there is no clear sky behind the smoke; the matte is uncertain."
-        return dataclasses.replace(background, warnings=[("matte_uncertain", f"{text} A garbage matte helps.")])
+        return None
     noise = max(float(np.median([sky.residual for sky in skies])), 0.5 / 255)
     measured["sky_residual"] = noise
     return Background(
         plate=None, motion=motion, skies=skies, sky_frames=found, noise=noise, is_temporal=False, measured=measured,
-        reason="The camera travels; the smoke is told from the clear sky behind it.",
+        reason="The camera moves; the smoke is told from the clear sky behind it.",
     )  # fmt: skip

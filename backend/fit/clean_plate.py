@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +20,7 @@ _MIN_STEP = 1.0 / 255  # sRGB code; codecs move a still pixel by as much when sm
 _STANDS_OUT = 0.7  # of the values around a background lie close to it; shades of lasting smoke follow each other evenly
 _BREADTH = 0.01  # of the longest side
 _CALM = 0.1  # share of the frames that differ from the plate
+_NOISE_VALUES = 2_000_000  # looked at for the noise
 _BAND_VALUES = 8_000_000  # temporal statistics are taken over bands of rows of this size
 
 
@@ -74,13 +74,18 @@ def _connected_with_calm(is_seen: np.ndarray, activity: np.ndarray) -> np.ndarra
 
 
 def frame_noise(coded: Sequence[np.ndarray]) -> float:
-    """Noise of one frame [h, w, 3], sRGB code: from differences of frames in time.
+    """Noise of frames [h, w, 3], sRGB code: how much a pixel without smoke departs from its median over time.
 
-    The calmest quarter of the pixels tells it, because smoke may cover the others: a quarter of normally distributed
-    values lies within 0.3186 of their deviation, and a difference of two has sqrt(2) of it.
+    Median absolute deviation (times 1.4826 for a normal distribution), of the calmest quarter of the pixels, because
+    smoke may cover the others.
     """
-    spreads = [np.nanpercentile(np.abs(b - a), 25) / (0.3186 * np.sqrt(2.0)) for a, b in itertools.pairwise(coded)]
-    return max(float(np.median(spreads)), _MIN_NOISE)
+    stride = max(1, round((coded[0].size * len(coded) / _NOISE_VALUES) ** 0.5))
+    values = np.stack([frame[::stride, ::stride] for frame in coded])
+    values = values[:, np.isfinite(values).all(axis=(0, -1))]
+    if values.size == 0:
+        return _MIN_NOISE
+    deviation = 1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+    return max(float(np.percentile(deviation, 25)), _MIN_NOISE)
 
 
 def _band(coded: np.ndarray, noise: float, smoke: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -56,9 +56,24 @@ class Matte:
         color, is_known = self.background.at(index)
         assert self.smoke is not None
         allowed = is_known if self.region is None else is_known & self.background.placed(self.region, index)
-        opacity = _opacity(image, color, allowed, self.smoke, self.background.noise, self.radius, kept=self.masks.kept)
+        opacity = self._opacity(image, color, allowed, self.background.seeds(index))
         light = np.maximum(image - (1.0 - opacity[..., None]) * color, 0.0) * (opacity[..., None] > 0.0)
         return np.concatenate([self.smoke.limited(light), opacity[..., None]], axis=2)
+
+    def _opacity(self, image: np.ndarray, color: np.ndarray, allowed: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
+        """[h, w] 0..1 opacity of an image [h, w, 3] before a background [h, w, 3], filtered and freed of specks."""
+        assert self.smoke is not None
+        found = matting.solve_opacity(image, color, self.smoke, self.background.noise)
+        guide = linear_to_srgb(image @ LUMINANCE)
+        raw = np.where(allowed, found.value, 0.0)
+        value = matting.guided_filter(raw, guide, radius=self.radius, epsilon=_GUIDE_EPSILON)
+        value = np.where(allowed, value, 0.0)
+        low = np.maximum(_LOW_NOISES * np.minimum(found.deviation, 0.2) / np.sqrt(2.0 * self.radius + 1.0), _MIN_LOW)
+        min_pixels = max(9, round(_MIN_REGION * value.size))
+        keep = matting.hysteresis(value, low=low, high=_HIGH, min_pixels=min_pixels, explained=found.explained, seeds=seeds)
+        if self.masks.kept is not None:
+            keep = np.where(self.masks.kept, 1.0, keep)
+        return (value * keep).astype(np.float32)
 
 
 def prepare(
@@ -88,30 +103,6 @@ def prepare(
     measured["smoke_brightness_spread"] = smoke.spread
     region = _region(images, chosen, matte) if background.is_temporal else None
     return Matte(background=background, smoke=smoke, region=region, masks=masks, radius=radius, measured=measured)
-
-
-def _opacity(
-    image: np.ndarray,
-    color: np.ndarray,
-    allowed: np.ndarray,
-    smoke: SmokeColor,
-    noise: float,
-    radius: int,
-    *,
-    kept: np.ndarray | None,
-) -> np.ndarray:
-    """[h, w] 0..1 opacity of an image [h, w, 3] before a background [h, w, 3], filtered and freed of specks."""
-    found = matting.solve_opacity(image, color, smoke, noise)
-    guide = linear_to_srgb(image @ LUMINANCE)
-    raw = np.where(allowed, found.value, 0.0)
-    value = matting.guided_filter(raw, guide, radius=radius, epsilon=_GUIDE_EPSILON)
-    value = np.where(allowed, value, 0.0)
-    low = np.maximum(_LOW_NOISES * np.minimum(found.deviation, 0.2) / np.sqrt(2.0 * radius + 1.0), _MIN_LOW)
-    min_pixels = max(9, round(_MIN_REGION * value.size))
-    keep = matting.hysteresis(value, low=low, high=_HIGH, min_pixels=min_pixels, explained=found.explained)
-    if kept is not None:
-        keep = np.where(kept, 1.0, keep)
-    return (value * keep).astype(np.float32)
 
 
 def _is_different(image: np.ndarray, color: np.ndarray, noise: float) -> np.ndarray:

@@ -18,6 +18,7 @@ _OPACITY_SPREAD = 1.0  # prior deviation of opacity around 0: holds it down wher
 _MOVING_NOISE = 5.0 / 255  # sRGB code: video codecs spend few bits on what moves, above all on its colour
 _ROUNDS = 3  # the spread of the brightness term depends on the opacity itself
 _MIN_COLOR_PIXELS = 64
+_FAINTEST = 12.0 / 255  # sRGB code: smoke that nowhere stands out by more is lost in coding and changing light
 _TINT_SLACK = 1.1
 _DARKEST = 0.4  # of the brightness: no side of the smoke is darker
 _MIN_SPREAD = 0.25  # of the brightness: the densest pixels are the lit ones, the shaded side is darker
@@ -136,11 +137,13 @@ def hysteresis(
     min_pixels: int = 9,
     explained: np.ndarray | None = None,  # [h, w] 0..1, of which a region must have `min_explained` in the mean
     min_explained: float = 0.6,
+    seeds: np.ndarray | None = None,  # [h, w] bool: where `high` must be reached
 ) -> np.ndarray:
     """[h, w] 0..1: what to keep of an opacity. Regions that stay below `high`, are specks or unlike smoke, go."""
     num, labels = components(opacity > low)
     reaches = np.zeros(num, np.int64)
-    np.add.at(reaches, labels[opacity > high], 1)
+    is_high = opacity > high if seeds is None else (opacity > high) & seeds
+    np.add.at(reaches, labels[is_high], 1)
     is_kept = (reaches >= max(1, min_pixels // 3)) & (np.bincount(labels.ravel(), minlength=num) >= min_pixels)
     if explained is not None:
         mass = np.bincount(labels.ravel(), weights=opacity.ravel(), minlength=num)
@@ -164,7 +167,7 @@ def estimate_smoke_color(
     """
     colors, strengths = [], []
     for image, background, candidate in zip(images, backgrounds, candidates, strict=True):
-        scaled = (image - background) / coded_noise_to_linear(np.maximum(image, background), noise)
+        scaled = (image - background) / coded_noise_to_linear(np.maximum(image, background), max(noise, _FAINTEST / 8.0))
         strength = np.sqrt(_dot(scaled, scaled))
         is_strong = candidate & (strength > 8.0)
         colors.append(image[is_strong])
