@@ -1,0 +1,106 @@
+"""The command line of the benchmark. Each step runs in the environment it needs, started from here.
+
+    python3 wildsmoke.py synth list                                    scenes and presets
+    python3 wildsmoke.py synth make SCENE --out DIR [--preset bench]   simulate, render and assemble, one after the other
+    python3 wildsmoke.py synth simulate SCENE --out DIR [--preset bench]
+    python3 wildsmoke.py synth render SCENE --out DIR [--preset bench] [--frames A:B] [--views ...] [--smoke DIR] ...
+    python3 wildsmoke.py synth assemble SCENE --out DIR [--preset bench]
+    python3 wildsmoke.py synth demo --out DIR                          the bundled clip and its truth
+
+Every step goes on where it was interrupted. The Pythons are .venv/backend and .venv/blender of the checkout;
+--backend-python and --blender-python name others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from backend.contract.errors import EXIT_DONE, EXIT_USER, BackendError
+from synthetic.presets import PRESETS
+from synthetic.scenes import SCENES
+
+_CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+def main(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(__doc__)
+        return EXIT_DONE
+    parser = argparse.ArgumentParser(prog="synth", add_help=False)
+    parser.add_argument("--backend-python", type=Path, default=_python("backend"))
+    parser.add_argument("--blender-python", type=Path, default=_python("blender"))
+    pythons, rest = parser.parse_known_args(arguments)
+    command, rest = rest[0], rest[1:]
+    try:
+        if command == "list":
+            return _list()
+        if command == "render":
+            return _run(pythons.blender_python, "synthetic.render", rest)
+        if command in ("simulate", "assemble"):
+            return _run(pythons.backend_python, "synthetic.record", [command, *rest])
+        if command == "make":
+            return _make(pythons, rest)
+        if command == "demo":
+            return _make(pythons, ["demo", "--preset", "demo", *rest])
+        raise BackendError("unknown_command", f'There is no command "{command}".', hint="See `synth --help`.")
+    except BackendError as error:
+        print(f"synthetic: {error}", file=sys.stderr)
+        return EXIT_USER
+
+
+def _list() -> int:
+    for scene in SCENES.values():
+        print(f"{scene.name:<16} {scene.purpose}")
+    print()
+    for name, preset in PRESETS.items():
+        print(
+            f"{name:<16} {preset.width}x{preset.height}, {preset.num_frames} frames at {preset.fps:g} a second, "
+            f"{preset.num_future} of them unseen, {preset.quality.samples} samples, voxels of {preset.voxel_size:g} m"
+        )
+    return EXIT_DONE
+
+
+def _make(pythons: argparse.Namespace, arguments: list[str]) -> int:
+    """The three steps; stops at the first that fails."""
+    parser = argparse.ArgumentParser(prog="synth make", description="Simulate, render and assemble a scene.")
+    parser.add_argument("scene")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="bench")
+    given = parser.parse_args(arguments)
+    common = [given.scene, "--out", str(given.out), "--preset", given.preset]
+    for python, module, extra in (
+        (pythons.backend_python, "synthetic.record", ["simulate"]),
+        (pythons.blender_python, "synthetic.render", []),
+        (pythons.backend_python, "synthetic.record", ["assemble"]),
+    ):
+        code = _run(python, module, [*extra, *common])
+        if code != EXIT_DONE:
+            return code
+    return EXIT_DONE
+
+
+def _python(environment: str) -> Path:
+    """The interpreter of one of the checkout's environments."""
+    place = "Scripts/python.exe" if os.name == "nt" else "bin/python"
+    return _CHECKOUT / ".venv" / environment / place
+
+
+def _run(python: Path, module: str, arguments: list[str]) -> int:
+    """Run a module of ours under another Python. Raises BackendError where there is none."""
+    if not python.exists():
+        raise BackendError(
+            "python_missing",
+            f"There is no Python at {python}.",
+            hint="Run `python3 wildsmoke.py synth ...`, which sets it up, or name one with --backend-python or --blender-python.",
+        )
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(_CHECKOUT), environment.get("PYTHONPATH")]))
+    return subprocess.run([str(python), "-m", module, *arguments], env=environment, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
