@@ -59,7 +59,7 @@ class FluidParameters:
 
     smoothing_length: m. rest_density: particles/m^3 beyond which they push each other apart. buoyancy: m/s^2, a vector.
     wind: velocity of the surrounding air, m/s. drag: towards the wind, 1/s. surface_drag: the same where the smoke
-    borders on air, in proportion to 1 - rho / rho_0 (Macklin 2014 eq. 30), 1/s; shears the edge, so that it rolls up.
+    borders on air, in proportion to 1 - rho / rho_0 (Macklin 2014, gases), 1/s; shears the edge, so that it rolls up.
     solver_iterations: projections a substep.
     max_substeps: a step. tensile_strength: of the artificial pressure that keeps particles from clumping, relative to
     the pressure of an over-density of one; tensile_exponent: how suddenly it sets in. viscosity: how fast neighbours'

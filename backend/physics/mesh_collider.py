@@ -1,101 +1,116 @@
-"""A closed mesh as a solid: signed distance to a dense sampling of its surface.
-
-A point's nearest surface sample tells how far it is and, by that sample's normal, on which side. Samples lie closer
-than 1/64 of the mesh's size, so the distance errs by less than that where it matters, near the surface.
-"""
+"""A solid of triangles, read from a Wavefront .obj whose z axis points up and whose unit is the metre."""
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from backend.contract.errors import BackendError
 
-SAMPLES_PER_SIDE = 64  # of the mesh's longest side
-_HINT = "Export the mesh as a closed Wavefront .obj, in metres, z up."
+from .signed_distance import BAND, signed_distance_grid
+
+RESOLUTION = 64  # voxels along the longest side of the mesh
+_HINT = "Export a closed mesh as Wavefront .obj, with z up."
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeshCollider:
-    """The samples of a closed surface, with normals that point outward. friction: as of every collider."""
+    """A closed mesh as signed distances on a lattice: node (i, j, k) is at origin + voxel_size (i, j, k), in m."""
 
-    points: np.ndarray  # [S, 3] m
-    normals: np.ndarray  # [S, 3]
-    tree: KDTree
+    origin: np.ndarray  # [3] m
+    voxel_size: float  # m
+    values: np.ndarray  # [X, Y, Z] m, negative inside
     friction: float = 0.0
 
-    def distances(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distance [N] m, negative inside, and unit normals [N, 3] that point out."""
-        _, nearest = self.tree.query(positions)
-        normals = self.normals[nearest]
-        return np.einsum("ij,ij->i", positions - self.points[nearest], normals), normals
-
-
-def read_collider(path: str) -> MeshCollider:
-    """A Wavefront .obj as a collider. Raises BackendError if it cannot be read or holds no surface."""
-    try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise BackendError("collider_unreadable", f"{path} cannot be read.", hint="Check the path of the mesh.") from error
-    try:
-        vertices, triangles = _parse(lines)
-    except (ValueError, IndexError) as error:
-        raise BackendError("collider_unreadable", f"{path} is no mesh that can be read ({error}).", hint=_HINT) from error
-    return make_collider(vertices, triangles, name=path)
+    def distances(
+        self,
+        positions: np.ndarray,  # [N, 3] m
+    ) -> tuple[np.ndarray, np.ndarray]:  # [N] m, [N, 3]
+        """Trilinear signed distance and its normalised gradient; off the lattice, what is nearest on it and the way there."""
+        last = np.array(self.values.shape) - 1
+        wanted = (positions - self.origin) / self.voxel_size
+        inside = np.clip(wanted, 0.0, last)
+        cell = np.minimum(np.floor(inside).astype(np.int64), last - 1)
+        share = inside - cell
+        values, slopes = np.zeros(len(positions)), np.zeros((len(positions), 3))
+        for corner in np.ndindex(2, 2, 2):
+            weights = np.where(np.array(corner) == 1, share, 1.0 - share)  # [N, 3]
+            value = self.values[tuple((cell + corner).T)]
+            values += weights.prod(axis=1) * value
+            for axis in range(3):
+                others = weights[:, (axis + 1) % 3] * weights[:, (axis + 2) % 3]
+                slopes[:, axis] += (2 * corner[axis] - 1) * others * value
+        away = (wanted - inside) * self.voxel_size
+        beyond = np.sqrt(np.square(away).sum(axis=1))
+        slopes = np.where((beyond > 0.0)[:, None], away, slopes)
+        lengths = np.sqrt(np.square(slopes).sum(axis=1))
+        is_level = lengths < 1e-12 * self.voxel_size  # in the middle of the solid every way out is as good; up is taken
+        normals = np.where(is_level[:, None], [0.0, 0.0, 1.0], slopes / np.where(is_level, 1.0, lengths)[:, None])
+        return values + beyond, normals
 
 
 def make_collider(
     vertices: np.ndarray,  # [V, 3] m
-    triangles: np.ndarray,  # [T, 3] indices, counter-clockwise seen from outside, or all the other way round
+    triangles: np.ndarray,  # [T, 3] int64
     *,
-    name: str = "the mesh",
+    friction: float = 0.0,
+    resolution: int = RESOLUTION,
 ) -> MeshCollider:
-    """The collider of a closed mesh. Raises BackendError where it encloses nothing."""
-    corners = vertices[triangles]  # [T, 3, 3]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double_area = np.linalg.norm(cross, axis=1)
-    volume = float(np.einsum("ij,ij->i", corners[:, 0] - vertices.mean(axis=0), cross).sum()) / 6.0
-    size = float(np.ptp(vertices, axis=0).max(initial=0.0)) if len(vertices) else 0.0
-    if not size > 0.0 or abs(volume) < 1e-9 * size**3:
-        raise BackendError("collider_empty", f"{name} encloses no volume.", hint=_HINT)
-    keep = double_area > 1e-14 * size * size
-    corners, cross, double_area = corners[keep], cross[keep], double_area[keep]
-    normals = np.sign(volume) * cross / double_area[:, None]
-    points, of_triangle = _sampled(corners, spacing=size / SAMPLES_PER_SIDE)
-    return MeshCollider(points=points, normals=normals[of_triangle], tree=KDTree(points))
+    """The solid inside a closed mesh. Raises BackendError if the mesh has no inside."""
+    used = vertices[np.unique(triangles)] if len(triangles) else np.zeros((0, 3))
+    extent = float(np.ptp(used, axis=0).max()) if len(used) else 0.0
+    if not (math.isfinite(extent) and extent > 0.0):
+        raise BackendError("collider_empty", "The collider's mesh has no extent.", hint=_HINT)
+    voxel_size = extent / resolution
+    padding = math.ceil(BAND) + 1
+    origin = used.min(axis=0) - padding * voxel_size
+    spans = np.ceil(np.ptp(used, axis=0) / voxel_size).astype(np.int64) + 2 * padding + 1
+    shape = (int(spans[0]), int(spans[1]), int(spans[2]))
+    values = signed_distance_grid((vertices - origin) / voxel_size, triangles, shape) * voxel_size
+    if not values.min() < 0.0:
+        raise BackendError("collider_open", "The collider's mesh is not closed or too thin to have an inside.", hint=_HINT)
+    return MeshCollider(origin=origin, voxel_size=voxel_size, values=values, friction=friction)
 
 
-def _sampled(corners: np.ndarray, *, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points [S, 3] on triangles [T, 3, 3], no two neighbours further apart than `spacing`, and the triangle of each."""
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    points, owners = [], []
-    for triangle, (corner, edge) in enumerate(zip(corners, longest, strict=True)):
-        count = max(1, int(np.ceil(edge / spacing)))
-        i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
-        inside = i + j < count
-        u, v = (i[inside] + 1 / 3) / count, (j[inside] + 1 / 3) / count
-        points.append(corner[0] + u[:, None] * (corner[1] - corner[0]) + v[:, None] * (corner[2] - corner[0]))
-        owners.append(np.full(len(u), triangle))
-    return np.concatenate(points), np.concatenate(owners)
+def read_collider(path: str | os.PathLike[str], *, friction: float = 0.0) -> MeshCollider:
+    """The solid in an .obj file. Raises BackendError."""
+    vertices, triangles = read_obj(path)
+    return make_collider(vertices, triangles, friction=friction)
 
 
-def _parse(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [T, 3] of a Wavefront file; polygons are fanned."""
-    vertices, triangles = [], []
-    for line in lines:
+def read_obj(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and triangles [T, 3] of a Wavefront .obj; larger faces become fans. Raises BackendError."""
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError as error:
+        raise BackendError("collider_missing", f"There is no collider at {path}.", hint="Give the path of an .obj.") from error
+    except OSError as error:
+        raise BackendError("collider_unreadable", f"{path} cannot be read: {error}.", hint=_HINT) from error
+    vertices: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for number, line in enumerate(lines, start=1):
         words = line.split()
-        if words[:1] == ["v"]:
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[:1] == ["f"]:
-            corners = [int(word.split("/")[0]) for word in words[1:]]
-            corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
-            triangles += [[corners[0], corners[k], corners[k + 1]] for k in range(1, len(corners) - 1)]
-    table, faces = np.array(vertices, np.float64).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3)
-    if not len(faces):
-        raise ValueError("it has no faces")
-    if faces.min() < 0 or faces.max() >= len(table) or not np.isfinite(table).all():
-        raise ValueError("a face names a vertex that is not there, or a coordinate is not finite")
-    return table, faces
+        try:
+            if words[:1] == ["v"]:
+                vertices.append([float(word) for word in words[1:4]])
+            elif words[:1] == ["f"]:
+                corners = [_corner(word, len(vertices)) for word in words[1:]]
+                triangles += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
+        except (ValueError, IndexError) as error:
+            raise BackendError("collider_unreadable", f"Line {number} of {path} is no .obj: {error}.", hint=_HINT) from error
+    if not triangles or not all(len(vertex) == 3 and all(map(math.isfinite, vertex)) for vertex in vertices):
+        raise BackendError("collider_unreadable", f"{path} holds no usable faces.", hint=_HINT)
+    return np.array(vertices), np.array(triangles, np.int64)
+
+
+def _corner(word: str, num_vertices: int) -> int:
+    """Index from 0 of a corner such as 7, 7/1, 7//3 or -1, the last vertex so far."""
+    index = int(word.split("/")[0])
+    index = index - 1 if index > 0 else num_vertices + index
+    if not 0 <= index < num_vertices:
+        raise IndexError(f"vertex {word} does not exist")
+    return index
