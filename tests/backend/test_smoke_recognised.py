@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
+import av
 import h5py
 import numpy as np
 import pytest
@@ -158,3 +161,14 @@ def test_frame_stack_round_trip_and_same_bytes(tmp_path) -> None:
             stack[5]
         with pytest.raises(BackendError):
             FrameStack(file, "others")
+
+
+def test_exr_is_linear_light(tmp_path) -> None:
+    """FFmpeg stores planes in the order G, B, R; the image comes back as R, G, B, and values are not sRGB."""
+    image = np.zeros((16, 16, 3), np.float32)
+    image[:] = [0.5, 0.25, 0.125]
+    codec = av.CodecContext.create("exr", "w")
+    codec.width, codec.height, codec.pix_fmt, codec.time_base = 16, 16, "gbrpf32le", Fraction(1, 24)
+    packets = codec.encode(av.VideoFrame.from_ndarray(image, format="gbrpf32le")) + codec.encode(None)
+    (tmp_path / "a.exr").write_bytes(b"".join(bytes(packet) for packet in packets))
+    assert np.abs(read_linear(tmp_path / "a.exr") - image).max() < 1e-4
