@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from backend.contract import events
 from backend.contract.errors import Cancelled
 
-STOP_AFTER_ORPHANED = 1.5  # seconds a step may still take once Blender is gone
+STOP_AFTER_ORPHANED = 0.8  # seconds a step may still take once Blender is gone; all must be over within two
 STOP_AFTER_CANCEL = 5.0  # seconds a step may still take after a cancel
 
 

@@ -6,6 +6,7 @@ video -> frames -> smoke layer -> cameras -> physical particles -> visual partic
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -52,6 +53,9 @@ def run_job(path: Path, sink: EventSink, stop: StopRequest) -> Result:
         )
     with storage_errors(folder.path):
         running.mark_running(path)
+    if not Path(os.environ["NUMBA_CACHE_DIR"]).is_dir():
+        message = "First run of this version: the kernels are compiled as they are needed, which takes about a minute in all."
+        sink.send(events.Warning(code="first_run", message=message))
     pipeline = Pipeline(folder, job, sink, stop)
     try:
         return pipeline.run()

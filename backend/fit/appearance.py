@@ -24,6 +24,7 @@ SCALE_SHARE = 0.6  # standard deviation of a particle at birth, share of the mea
 DEATH_SHARE = 0.02  # of a particle's own share of the smoke: below it a particle is spent
 BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fill detail
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
+CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel
 
 
@@ -66,7 +67,7 @@ class Appearance:
         """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
-        record = self._calmed(record, layer, view)
+        record = self._calmed(record, layer, view, depth_prior.inflate(target, view, self.scene.anchor))
         kept = config.consistency if consistency is None else consistency
         record = self._weighed(record, frame, target, consistency=kept)
         record = self._births(record, frame, target)
@@ -75,8 +76,9 @@ class Appearance:
             return record, 0.0
         return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale)
 
-    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View) -> VisualRecord:
-        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows.
+    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, prior: depth_prior.DepthPrior) -> VisualRecord:
+        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows,
+        depth into the prior's solid.
 
         Behind the surface of thick smoke nothing holds single particles, and noise would gather in them from frame to
         frame. The fit that follows restores what the view does tell.
@@ -93,7 +95,8 @@ class Appearance:
         shown = seen / np.maximum(opacity, 0.02)
         share = CALM_COLOR * (opacity > 0.05)
         colors = (1.0 - share) * record.colors + share * shown
-        return replace(record, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
+        positions = depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH)
+        return replace(record, positions=positions, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
 
     def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
         """Masses after the frame was seen, without the spent and the departed."""
