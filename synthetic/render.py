@@ -114,6 +114,8 @@ def _render_one(order: RenderOrder, image: Image, smoke: _SmokeFiles) -> float |
     with claimed(target) as is_ours:
         if not is_ours:
             return None
+        for left_behind in target.parent.glob(f"{target.name}.*.part*"):  # by a worker that was killed
+            left_behind.unlink()
         begin = time.monotonic()
         has_smoke = image.layer in (Layer.CLIP, Layer.SMOKE)
         show_smoke(smoke.path(image.frame) if has_smoke else None)
