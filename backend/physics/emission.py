@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .colliders import Vector
-from .fluid import FluidState
+from .state import FluidState
 
 _MOST = 10_000_000  # particles at once; more is a mistake in the rate
 

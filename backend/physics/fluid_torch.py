@@ -1,4 +1,4 @@
-"""The step of fluid.py in plain torch: the same formulas to read, for any device and dtype, and to test against.
+"""The step of fluid.py and solver.py in plain torch: the same formulas to read, for any device and dtype, and to test against.
 
 Pairs are found anew for every pass, so there is nothing that could be out of date. Units and symbols as in
 projection.py: positions x [h], motion u [h per substep], number density [1/h^3].
@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from .colliders import deflect, push_out
-from .fluid import EPSILON_SHARE, MAX_SHIFT, MAX_TRAVEL, RELAXATION, FluidParameters
 from .kernels import POLY6, SPIKY_SLOPE, SPIKY_SQUARED_GRADIENT
 from .projection import COINCIDENT, separation
+from .solver import EPSILON_SHARE, MAX_SHIFT, MAX_TRAVEL, RELAXATION
+from .state import FluidParameters
 
 _BLOCK = 1024  # rows of the distance table that are held at a time
 

@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit, prange
 from scipy.spatial import KDTree
 
-from .fluid import FluidState
 from .neighbours import MAX_RANGES, build_grid, candidate_ranges
+from .state import FluidState
 from .threads import threads_for
 
 SPARSE = 0.05  # weight below which the nearest particles begin to have a say; 1: a particle in the very place

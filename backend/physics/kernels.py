@@ -2,6 +2,8 @@
 
 Symbols: r distance between two particles [m], h smoothing length [m]. Both kernels vanish at and beyond r = h and
 integrate to one over space. Mueller et al. 2003, "Particle-Based Fluid Simulation for Interactive Applications".
+
+Numba caches a compiled function until its own file changes: after an edit here, remove __pycache__.
 """
 
 from __future__ import annotations

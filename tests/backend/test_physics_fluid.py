@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from backend.contract.errors import BackendError
 from backend.physics import fluid as fluids
+from backend.physics import solver as solver_parts
 from backend.physics.fluid import FluidParameters, FluidState, derive_parameters, step
 from backend.physics.kernels import POLY6
 from tests.reference import fluid_loops
@@ -89,21 +90,21 @@ def test_substeps_and_limit_are_reported():
 def test_sums_against_slow_loops():
     state = cloud(60)
     length, rest_density = 0.5, 30.0
-    solver = fluids._Solver(state.positions / length, state.ids, rest_density=rest_density * length**3)
+    solver = solver_parts.Solver(state.positions / length, state.ids, rest_density=rest_density * length**3)
     solver.constrain(pulls=False)
     np.testing.assert_allclose(solver.densities / length**3, fluid_loops.densities(state.positions, length), rtol=1e-12)
-    epsilon = fluids.EPSILON_SHARE * solver.squares_at_rest / length**2
+    epsilon = solver_parts.EPSILON_SHARE * solver.squares_at_rest / length**2
     lambdas = fluid_loops.lambdas(state.positions, length, rest_density, epsilon)
     assert np.count_nonzero(lambdas) > 30
     np.testing.assert_allclose(solver.lambdas * length**2, lambdas, rtol=1e-10)
     tensile = 0.02 / solver.squares_at_rest * length**2
     parameters = FluidParameters(smoothing_length=length, rest_density=rest_density, tensile_strength=0.02)
-    limit, fluids.MAX_SHIFT = fluids.MAX_SHIFT, 1e9  # without the limit, the formula alone
+    limit, solver_parts.MAX_SHIFT = solver_parts.MAX_SHIFT, 1e9  # without the limit, the formula alone
     try:
         solver.correct(parameters)
     finally:
-        fluids.MAX_SHIFT = limit
-    unlimited = fluid_loops.shifts(state.positions, length, rest_density, lambdas, tensile) * fluids.RELAXATION
+        solver_parts.MAX_SHIFT = limit
+    unlimited = fluid_loops.shifts(state.positions, length, rest_density, lambdas, tensile) * solver_parts.RELAXATION
     np.testing.assert_allclose(solver.shifts * length, unlimited, rtol=1e-9, atol=1e-12)
 
 
@@ -116,7 +117,7 @@ def test_squares_at_rest_match_random_points():
     for centre in centres:
         near = positions[np.linalg.norm(positions - centre, axis=1) < 1.0]
         sums.append(sum(float(np.square(fluid_loops.spiky_gradient(centre - x, 1.0)).sum()) for x in near))
-    solver = fluids._Solver(np.zeros((1, 3)), np.zeros(1, np.int64), rest_density=rest_density)
+    solver = solver_parts.Solver(np.zeros((1, 3)), np.zeros(1, np.int64), rest_density=rest_density)
     assert solver.squares_at_rest == pytest.approx(np.mean(sums) / rest_density**2, rel=0.1)
 
 
@@ -330,7 +331,21 @@ def test_nothing_becomes_nan(exponents, seed, pulls):
         state, report = step(state, parameters, dt)
         assert np.isfinite(state.positions).all() and np.isfinite(state.velocities).all()
     moved = np.linalg.norm(state.positions - offset, axis=1).max()
-    assert moved <= squeeze * 2.0 + 3 * report.substeps * 0.3 * (0.4 + 3 * fluids.MAX_SHIFT) + 1e-9 * offset
+    assert moved <= squeeze * 2.0 + 3 * report.substeps * 0.3 * (0.4 + 3 * solver_parts.MAX_SHIFT) + 1e-9 * offset
+
+
+@pytest.mark.parametrize("dt", [1e-59, 1e60])
+@pytest.mark.parametrize("length", [1e-18, 1e18])
+def test_the_largest_numbers_allowed(dt, length):
+    state = cloud(30, squeeze=length)
+    state = replace(state, velocities=np.sign(state.positions - 0.5 * length) * 1e60)
+    parameters = FluidParameters(
+        smoothing_length=length, rest_density=5.0 / length**3, buoyancy=(1e60, -1e60, 1e60), wind=(1e60, 0.0, 0.0), drag=1e60,
+        surface_drag=1e60, viscosity=1e60, vorticity_confinement=1e60, tensile_strength=1e3,
+    )  # fmt: skip
+    after, report = step(state, parameters, dt)
+    assert np.isfinite(after.positions).all() and np.isfinite(after.velocities).all()
+    assert np.abs(after.positions - state.positions).max() <= 3.0 * report.substeps * length
 
 
 @pytest.mark.parametrize("name", ["positions", "velocities", "masses"])
