@@ -60,10 +60,9 @@ def plan_images(preset: Preset, *, views: tuple[str, ...] | None = None) -> list
     return images
 
 
-def first_frames(preset: Preset) -> tuple[int, ...]:
-    """The frames that are made first, because the cost of all is estimated from them: first, middle, last."""
-    last = preset.num_frames - 1
-    return tuple(dict.fromkeys((0, last // 2, last)))
+def first_frames(start: int, stop: int) -> tuple[int, ...]:
+    """First, middle and last of start .. stop - 1: made first, because the cost of all is estimated from them."""
+    return tuple(dict.fromkeys((start, (start + stop - 1) // 2, stop - 1)))
 
 
 def _image(preset: Preset, view: str, layer: Layer, frame: int) -> Image:

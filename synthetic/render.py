@@ -79,7 +79,7 @@ def render_set(order: RenderOrder) -> int:
     build_scene(order)
     missing = [image for image in images if not (order.folder / image.path).exists()]
     progress = Progress(label=f"render {order.scene}", total=len(images), done=len(images) - len(missing))
-    samples = {frame: [] for frame in first_frames(order.preset)}
+    samples = {frame: [] for frame in first_frames(*_frame_range(order))}
     for index, image in enumerate(missing):
         seconds = _render_one(order, image, smoke)
         progress.step(is_made=seconds is not None)
@@ -163,18 +163,22 @@ def _ordered(order: RenderOrder) -> list[Image]:
             f'The preset has no view "{sorted(unknown)[0]}".',
             hint=f"Choose of {', '.join(order.preset.views)}.",
         )
-    images = plan_images(order.preset, views=order.views)
-    if order.frames is not None:
-        start, stop = order.frames
-        if not 0 <= start < stop <= order.preset.num_frames:
-            raise BackendError(
-                "bad_frame_range",
-                f"The frame range {start}:{stop} does not fit a clip of {order.preset.num_frames} frames.",
-                hint="Give A:B with 0 <= A < B.",
-            )
-        images = [image for image in images if start <= image.frame < stop]
-    early = set(first_frames(order.preset))
+    start, stop = _frame_range(order)
+    images = [image for image in plan_images(order.preset, views=order.views) if start <= image.frame < stop]
+    early = set(first_frames(start, stop))
     return sorted(images, key=lambda image: image.frame not in early)
+
+
+def _frame_range(order: RenderOrder) -> tuple[int, int]:
+    """First frame, and one past the last."""
+    start, stop = order.frames or (0, order.preset.num_frames)
+    if not 0 <= start < stop <= order.preset.num_frames:
+        raise BackendError(
+            "bad_frame_range",
+            f"The frame range {start}:{stop} does not fit a clip of {order.preset.num_frames} frames.",
+            hint="Give A:B with 0 <= A < B.",
+        )
+    return start, stop
 
 
 def _prepare_folders(order: RenderOrder, images: Sequence[Image]) -> None:

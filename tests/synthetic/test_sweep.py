@@ -89,4 +89,6 @@ def test_the_plan_names_every_image_once_and_leaks_nothing() -> None:
 
 
 def test_the_first_frames_are_first_middle_last() -> None:
-    assert first_frames(PRESETS["bench"]) == (0, 67, 134)
+    assert first_frames(0, 135) == (0, 67, 134)
+    assert first_frames(7, 9) == (7, 8)
+    assert first_frames(7, 8) == (7,)
