@@ -19,7 +19,7 @@ def encode_clip(
     target: Path,
     *,
     fps: float,
-    quality: int = 18,  # x264's constant rate factor: 0 lossless .. 51
+    quality: int = 14,  # x264's constant rate factor: 0 lossless .. 51
 ) -> None:
     """The frames as mp4, whole or absent; the same frames give the same bytes. Sizes must be even (4:2:0 colour)."""
     if not frames:
