@@ -19,6 +19,13 @@ _MAX_SPREAD = 4.0  # noise levels; frames that agree less than this show no back
 _MIN_STEP = 1.0 / 255  # sRGB code; codecs move a still pixel by as much when smoke passes beside it
 _STANDS_OUT = 0.7  # of the values around a background lie close to it; shades of lasting smoke follow each other evenly
 _BREADTH = 0.01  # of the longest side
+_RUN_SHARE = 0.15  # of the frames: a stretch of time in which the background shows itself
+_MIN_RUN = 8  # frames
+_RUN_POOL = 5  # px over which its changes are averaged
+_RUN_NOISE = 0.7  # noise levels: standard deviation below which a place stands still
+_TEXTURE = 3.0  # noise levels of detail that opaque smoke does not have
+_TEXTURE_POOL = 9  # px
+_BURNT_OUT = 0.97  # sRGB code
 _CALM = 0.1  # share of the frames that differ from the plate
 _NOISE_VALUES = 2_000_000  # looked at for the noise
 _BAND_VALUES = 8_000_000  # temporal statistics are taken over bands of rows of this size
@@ -102,6 +109,12 @@ def _band(coded: np.ndarray, noise: float, smoke: np.ndarray | None) -> tuple[np
         is_better = other_spread < 0.5 * _MAX_SPREAD * noise
         is_smoke = ~is_better & (is_like_smoke.mean(axis=0) > _FEW_SHARE) & (is_like_smoke.mean(axis=0) < 1.0 - _FEW_SHARE)
         centre, spread = np.where(is_better, other_centre, centre), np.where(is_better, other_spread, spread)
+    steady, is_steady = steadiest_run(coded, noise)
+    steady_centre = steady @ LUMINANCE
+    is_plain = texture(steady_centre) < _TEXTURE * max(noise, _MIN_STEP)
+    is_steady &= ~(is_plain & (True if smoke is None else np.abs(steady - smoke).max(axis=-1) < _LIKE_SMOKE))
+    centre, spread = np.where(is_steady, steady_centre, centre), np.where(is_steady, 0.0, spread)
+    is_smoke &= ~is_steady
     agrees = np.abs(luma - centre) < 0.5 * np.minimum(spread, 1.0) + 2.0 * noise
     weight = agrees[..., None].astype(np.float32)
     color = np.where(weight > 0, coded, 0.0).sum(axis=0) / np.maximum(weight.sum(axis=0), 1.0)
@@ -109,10 +122,40 @@ def _band(coded: np.ndarray, noise: float, smoke: np.ndarray | None) -> tuple[np
     unit = max(noise, _MIN_STEP)
     num_near = (distance < 3.0 * unit).sum(axis=0)
     stands_out = num_near > _STANDS_OUT * (distance < 9.0 * unit).sum(axis=0)
-    is_seen = (num >= length) & (spread < _MAX_SPREAD * noise) & stands_out & ~is_smoke
+    is_seen = is_steady | ((num >= length) & (spread < _MAX_SPREAD * noise) & stands_out & ~is_smoke)
     differs = np.abs(coded - color).max(axis=-1) > 5.0 * noise
     activity = differs.sum(axis=0) / np.maximum(num, 1)
     return color.astype(np.float32), is_seen, activity.astype(np.float32)
+
+
+def steadiest_run(coded: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Colour [r, w, 3] of the stretch of time in which each place changes least, and [r, w] whether it stood still then.
+
+    coded: [n, r, w, 3], NaN where a frame does not reach. Smoke never stands still to within noise, and neither does
+    its shadow; a background does, even one that looks like smoke. What is burnt out stands still too and says nothing.
+    """
+    length = max(_MIN_RUN, round(_RUN_SHARE * len(coded)))
+    if len(coded) < 2 * length:
+        return np.zeros(coded.shape[1:], np.float32), np.zeros(coded.shape[1:3], bool)
+    sums = np.cumsum(np.concatenate([np.zeros_like(coded[:1]), coded]), axis=0, dtype=np.float64)
+    squares = np.cumsum(np.concatenate([np.zeros_like(coded[:1]), coded**2]), axis=0, dtype=np.float64)
+    best = np.full(coded.shape[1:3], np.inf, np.float32)
+    color = np.zeros(coded.shape[1:], np.float32)
+    for start in range(len(coded) - length + 1):
+        mean = (sums[start + length] - sums[start]) / length
+        variance = ((squares[start + length] - squares[start]) / length - mean**2).mean(axis=-1)
+        pooled = cv2.blur(np.nan_to_num(variance, nan=1.0).astype(np.float32), (_RUN_POOL, _RUN_POOL))
+        is_better = pooled < best
+        best = np.where(is_better, pooled, best)
+        color = np.where(is_better[..., None], np.nan_to_num(mean), color)
+    is_steady = (best < (_RUN_NOISE * max(noise, _MIN_STEP)) ** 2) & (color.max(axis=-1) < _BURNT_OUT)
+    return color.astype(np.float32), is_steady
+
+
+def texture(luma: np.ndarray) -> np.ndarray:
+    """Standard deviation [h, w] of an image about its blur, over some pixels: detail, which opaque smoke has none of."""
+    detail = luma - cv2.GaussianBlur(luma, (0, 0), 2.0)
+    return np.sqrt(cv2.blur(detail * detail, (_TEXTURE_POOL, _TEXTURE_POOL)))
 
 
 def shortest_interval(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
