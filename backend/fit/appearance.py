@@ -6,7 +6,6 @@ the prior's depth; then gradient steps on colour and opacity.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from backend.fit import depth_prior, explain
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
+from backend.fit.series import Series
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer
@@ -31,7 +31,7 @@ CALM_COLOR = 0.25  # share of the way to the colour of its pixel
 class Appearance:
     """Fits Gaussians to frames of one scene."""
 
-    def __init__(self, scene: Scene, layers: Sequence[np.ndarray], config: VisualConfig, seed: int) -> None:
+    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: VisualConfig, seed: int) -> None:
         self.scene = scene
         self.layers = layers
         self.config = config
@@ -60,7 +60,7 @@ class Appearance:
             colors=np.zeros((0, 3), np.float32),
             ids=np.zeros(0, np.int64),
             born=np.zeros(0, np.int32),
-            next_id=np.int64(0),
+            next_id=np.asarray(0, np.int64),
         )
 
     def look(self, record: VisualRecord, frame: int, *, consistency: float | None = None) -> tuple[VisualRecord, float]:

@@ -13,6 +13,7 @@ from backend.contract.job import ExtractionConfig
 from backend.fit.clean_plate import CleanPlate, fill_smoothly, frame_noise, temporal_plate
 from backend.fit.connected import components
 from backend.fit.matting import SmokeColor, estimate_smoke_color
+from backend.fit.series import Series
 from backend.fit.sky import Sky, fit_sky
 from backend.fit.stabilise import ImageMotion, measure_motion, warp
 from backend.io.images import linear_to_srgb, read_linear, srgb_to_linear
@@ -96,7 +97,7 @@ class Background:
 
 
 def find_background(
-    frames: Sequence[np.ndarray],
+    frames: Series[np.ndarray],
     numbers: Sequence[int],
     config: ExtractionConfig,
     *,
@@ -140,7 +141,7 @@ def find_background(
 
 
 def _over_time(
-    frames: Sequence[np.ndarray],
+    frames: Series[np.ndarray],
     numbers: Sequence[int],
     motion: ImageMotion,
     measured: dict[str, float],
@@ -200,7 +201,7 @@ def _smoke_before(plate: CleanPlate, samples: list[np.ndarray]) -> SmokeColor | 
 
 
 def _before_sky(
-    frames: Sequence[np.ndarray], motion: ImageMotion, measured: dict[str, float], on_step: Callable[[int, int], None]
+    frames: Series[np.ndarray], motion: ImageMotion, measured: dict[str, float], on_step: Callable[[int, int], None]
 ) -> Background | None:
     """The sky behind the smoke of a camera that travels; None where there is no sky in most frames."""
     num = min(_MAX_SKY_FITS, max(2, -(-len(frames) // _SKY_SPACING)))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from backend.fit.connected import components
+from backend.fit.series import Series
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 _MODE_SHARE = 0.25  # of the frames that must agree: smoke may cover a pixel three quarters of the time
@@ -44,7 +44,7 @@ class CleanPlate:
     activity: np.ndarray
 
 
-def temporal_plate(samples: Sequence[np.ndarray], *, smoke: np.ndarray | None = None) -> CleanPlate:
+def temporal_plate(samples: Series[np.ndarray], *, smoke: np.ndarray | None = None) -> CleanPlate:
     """The plate of frames [h, w, 3] linear that lie on each other (NaN where a frame does not reach).
 
     Per pixel the shortest interval that holds a quarter of the frames (the half-sample mode of Bickel & Fruehwirth
@@ -80,7 +80,7 @@ def _connected_with_calm(is_seen: np.ndarray, activity: np.ndarray) -> np.ndarra
     return is_seen & calm[labels]
 
 
-def frame_noise(coded: Sequence[np.ndarray]) -> float:
+def frame_noise(coded: Series[np.ndarray]) -> float:
     """Noise of frames [h, w, 3], sRGB code: how much a pixel without smoke departs from its median over time.
 
     Median absolute deviation (times 1.4826 for a normal distribution), of the calmest quarter of the pixels, because

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from backend.contract.errors import BackendError
 from backend.contract.job import ExtractionConfig
 from backend.fit import matte, on_black
 from backend.fit.artist_masks import ArtistMasks, read_masks
+from backend.fit.series import Series
 from backend.reporting import Report
 
 _SAMPLES = 24  # frames looked at to recognise what the clip shows
@@ -33,7 +34,7 @@ class SmokeLayer:
     frames: Iterator[np.ndarray] = field(repr=False)
 
 
-def extract(frames: Sequence[np.ndarray], config: ExtractionConfig, report: Report, *, has_alpha: bool) -> SmokeLayer:
+def extract(frames: Series[np.ndarray], config: ExtractionConfig, report: Report, *, has_alpha: bool) -> SmokeLayer:
     """frames: each [h, w, 4] linear RGB and straight alpha. Raises BackendError "no_smoke" where there is none."""
     mode, reason, measured, black = recognise(frames, config, has_alpha=has_alpha)
     height, width = frames[0].shape[:2]
@@ -46,7 +47,7 @@ def extract(frames: Sequence[np.ndarray], config: ExtractionConfig, report: Repo
 
 
 def recognise(
-    frames: Sequence[np.ndarray], config: ExtractionConfig, *, has_alpha: bool
+    frames: Series[np.ndarray], config: ExtractionConfig, *, has_alpha: bool
 ) -> tuple[str, str, dict[str, float], on_black.BlackBackground]:
     """How the smoke is told from its background: mode, reason, measured quantities, and what is black about it."""
     samples = [frames[k] for k in _spread(len(frames), _SAMPLES)]
@@ -93,7 +94,7 @@ def _spread(num_frames: int, num_samples: int) -> list[int]:
 
 
 def _with_alpha(
-    frames: Sequence[np.ndarray], masks: ArtistMasks, report: Report, reason: str, measured: dict[str, float]
+    frames: Series[np.ndarray], masks: ArtistMasks, report: Report, reason: str, measured: dict[str, float]
 ) -> SmokeLayer:
     def layer(frame: np.ndarray) -> np.ndarray:
         return masks.limited(np.concatenate([frame[..., :3] * frame[..., 3:], frame[..., 3:]], axis=2))
@@ -111,7 +112,7 @@ def _with_alpha(
 
 
 def _on_black(
-    frames: Sequence[np.ndarray],
+    frames: Series[np.ndarray],
     black: on_black.BlackBackground,
     masks: ArtistMasks,
     report: Report,
@@ -135,7 +136,7 @@ def _on_black(
 
 
 def _matte(
-    frames: Sequence[np.ndarray],
+    frames: Series[np.ndarray],
     config: ExtractionConfig,
     masks: ArtistMasks,
     report: Report,
@@ -155,14 +156,14 @@ def _matte(
         mode="matte",
         reason=f"{reason} {prepared.reason}",
         measured=measured,
-        plate=prepared.plate(0),
+        plate=prepared.clear_picture(frames[0]),
         smoke_color=prepared.smoke.linear,
         frames=_streamed(frames, report, lambda index: masks.limited(prepared.layer(frames[index], index)), done=len(numbers)),
     )
 
 
 def _streamed(
-    frames: Sequence[np.ndarray], report: Report, layer: Callable[[int], np.ndarray], *, done: int = 0
+    frames: Series[np.ndarray], report: Report, layer: Callable[[int], np.ndarray], *, done: int = 0
 ) -> Iterator[np.ndarray]:
     for index in range(len(frames)):
         yield layer(index).astype(np.float32)

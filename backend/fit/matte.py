@@ -14,6 +14,7 @@ from backend.fit.artist_masks import ArtistMasks
 from backend.fit.background import Background, find_background
 from backend.fit.connected import components
 from backend.fit.matting import SmokeColor
+from backend.fit.series import Series
 from backend.io.images import LUMINANCE, linear_to_srgb
 
 _LOW_NOISES = 3.0  # opacity below this many deviations of noise is none
@@ -50,6 +51,14 @@ class Matte:
         """[h, w, 3] linear: the background of a frame."""
         return self.background.at(index)[0]
 
+    def clear_picture(self, frame: np.ndarray) -> np.ndarray:
+        """[h, w, 3] linear: the first frame without its smoke. A sky that was fitted says nothing of the ground below."""
+        opacity = self.layer(frame, 0)[..., 3]
+        size = 4 * max(1, self.radius) + 1
+        share = cv2.dilate(np.minimum(20.0 * opacity, 1.0).astype(np.float32), np.ones((size, size), np.uint8))
+        share = cv2.blur(share, (size, size))[..., None]
+        return (1.0 - share) * frame[..., :3] + share * self.plate(0)
+
     def layer(self, frame: np.ndarray, index: int) -> np.ndarray:
         """[h, w, 4] premultiplied linear RGB and opacity of a frame [h, w, >= 3]. Over the plate it gives the frame."""
         image = frame[..., :3]
@@ -77,7 +86,7 @@ class Matte:
 
 
 def prepare(
-    frames: Sequence[np.ndarray],
+    frames: Series[np.ndarray],
     numbers: Sequence[int],  # of the frames that the plate is made from
     config: ExtractionConfig,
     masks: ArtistMasks,

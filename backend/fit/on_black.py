@@ -6,13 +6,13 @@ a = luminance / luminance of the smoke where it is densest, which is exact for o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from backend.fit.connected import components
+from backend.fit.series import Series
 from backend.io.images import LUMINANCE, linear_to_srgb, srgb_to_linear
 
 MAX_BLACK_LEVEL = 20 / 255  # sRGB code; video black of limited range is 16
@@ -46,7 +46,7 @@ class BlackBackground:
         )
 
 
-def measure_black(samples: Sequence[np.ndarray]) -> BlackBackground:
+def measure_black(samples: Series[np.ndarray]) -> BlackBackground:
     """Black level, its noise, how much of the picture it covers. samples: frames [h, w, >= 3] linear."""
     coded = [linear_to_srgb(frame[..., :3].max(axis=2)) for frame in samples]
     values = np.concatenate([image.ravel() for image in coded])

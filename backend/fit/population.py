@@ -52,7 +52,7 @@ def join(record: AnyRecord, **newborn: np.ndarray) -> AnyRecord:
     for name in names:
         old = getattr(record, name)
         joined[name] = np.concatenate([old, np.asarray(newborn[name]).astype(old.dtype)])
-    return dataclasses.replace(record, **joined, next_id=np.int64(record.next_id + count))
+    return dataclasses.replace(record, **joined, next_id=np.asarray(record.next_id + count, np.int64))
 
 
 def buoyancy_of(record: PhysicalRecord) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

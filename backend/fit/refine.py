@@ -60,6 +60,8 @@ def refine(
     reference_scale: float,  # m, the scale of a particle at birth
 ) -> tuple[VisualRecord, float]:
     """The refined record and the loss before the last step."""
+    if len(record.positions) == 0:
+        return record, float(np.square(layer, dtype=np.float64).mean())
     target = np.ascontiguousarray(np.moveaxis(layer, -1, 0), np.float32)
     carried = record.positions
     scales = record.scales.astype(np.float64)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from backend.contract.cameras import Cameras
+from backend.fit.series import Series
 from backend.geometry.camera import View, view_at
 
 MAX_OPACITY = 0.99  # an 8-bit frame cannot tell more: beyond it optical depth is a guess
@@ -27,7 +27,7 @@ class Scene:
         return len(self.views)
 
 
-def make_scene(layers: Sequence[np.ndarray], cameras: Cameras) -> Scene:
+def make_scene(layers: Series[np.ndarray], cameras: Cameras) -> Scene:
     """layers: [H, W, 4] premultiplied linear RGB and opacity, one a frame."""
     height, width = layers[0].shape[:2]
     views = tuple(view_at(cameras, frame, size=(width, height)) for frame in range(len(layers)))
@@ -49,7 +49,7 @@ def _standing_point(view: View) -> np.ndarray:
     return view.position + distance * forward
 
 
-def _meeting_point(layers: Sequence[np.ndarray], views: tuple[View, ...]) -> np.ndarray:
+def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.ndarray:
     """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 32 frames.
 
     The foot (the lowest fifth of the smoke) is taken because a source stands still while the plume drifts.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from backend.fit.series import Series
 from backend.io.images import LUMINANCE, linear_to_srgb
 
 MAX_TRACKS = 400
@@ -58,7 +59,7 @@ class ImageMotion:
 
 
 def measure_motion(
-    frames: Sequence[np.ndarray],  # each [h, w, >= 3] linear
+    frames: Series[np.ndarray],  # each [h, w, >= 3] linear
     indices: Sequence[int],  # of the frames to look at, ascending
     *,
     background: Callable[[int], np.ndarray] | None = None,  # frame -> [h, w] bool, where no smoke is

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -48,6 +48,9 @@ class RecordFolder(Generic[Record]):
         with np.load(self._path(frame), allow_pickle=False) as arrays:
             return self._type(**{name: arrays[name] for name in arrays.files})
 
+    def __iter__(self) -> Iterator[Record]:
+        return (self[frame] for frame in range(len(self)))
+
     def save(self, frame: int, record: Record) -> None:
         with whole_file(self._path(frame)) as part, open(part, "wb") as handle:
             np.savez(handle, allow_pickle=False, **_arrays(record))
@@ -74,6 +77,9 @@ class RecordFile(Generic[Record]):
             raise IndexError(frame)
         group: Any = self._file[f"{frame:06d}"]
         return self._type(**{name: group[name][()] for name in group})
+
+    def __iter__(self) -> Iterator[Record]:
+        return (self[frame] for frame in range(len(self)))
 
     def close(self) -> None:
         self._file.close()

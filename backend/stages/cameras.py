@@ -8,7 +8,7 @@ f = (longer side / 2) / tan(field of view / 2), the same for x and y, with the p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from backend.contract.cameras import Cameras, Matrix
 from backend.contract.errors import BackendError
 from backend.contract.job import CamerasConfig
 from backend.fit import stabilise
+from backend.fit.series import Series
 from backend.fit.stabilise import ImageMotion
 from backend.reporting import Report
 
@@ -79,10 +80,10 @@ def still_camera(size: tuple[int, int], fps: float, config: CamerasConfig) -> Ca
 
 
 def measure_motion(
-    frames: Sequence[np.ndarray],  # each [h, w, >= 3] linear
+    frames: Series[np.ndarray],  # each [h, w, >= 3] linear
     report: Report,
     *,
-    smoke: Sequence[np.ndarray] | None = None,  # each [h, w, 4], its opacity excludes smoke
+    smoke: Series[np.ndarray] | None = None,  # each [h, w, 4], its opacity excludes smoke
 ) -> ImageMotion:
     """How the picture moves as a whole, from features of the background (backend.fit.stabilise)."""
     num = min(len(frames), _MAX_SAMPLES)

@@ -7,7 +7,7 @@ frame shows, as seen from its camera: near frames move, far ones come to rest at
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,12 +17,13 @@ from backend.contract.job import ForecastConfig, VisualConfig
 from backend.fit.appearance import Appearance
 from backend.fit.carry import carry, with_velocities
 from backend.fit.scene import make_scene
+from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.reporting import Report
 
 
 def run(
-    layers: Sequence[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
+    layers: Series[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
     cameras: Cameras,
     last_fluid: PhysicalRecord,
     last_seen: VisualRecord,

@@ -8,7 +8,7 @@ frames changed about the velocities is, in the mean, the force that the fluid la
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
@@ -20,6 +20,7 @@ from backend.fit import depth_prior, explain, image_motion
 from backend.fit.carry import as_fluid
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.scene import Scene, make_scene, optical_depth
+from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord
 from backend.geometry.camera import View
 from backend.physics import fluid as fluids
@@ -37,13 +38,13 @@ BUOYANCY_RIDGE = 20.0  # observations at which the learned buoyancy has half its
 
 
 def run(
-    layers: Sequence[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
+    layers: Series[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
     cameras: Cameras,
     config: PhysicalConfig,
     report: Report,
     *,
     seed: int,
-    done: Sequence[PhysicalRecord],
+    done: Series[PhysicalRecord],
 ) -> Iterator[PhysicalRecord]:
     """Yields the records of the frames behind those that are `done`."""
     fit = _Fit(make_scene(layers, cameras), layers, config, seed)
@@ -59,7 +60,7 @@ def run(
 class _Fit:
     """The parts of the filter that do not change over time."""
 
-    def __init__(self, scene: Scene, layers: Sequence[np.ndarray], config: PhysicalConfig, seed: int) -> None:
+    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: PhysicalConfig, seed: int) -> None:
         self.scene = scene
         self.layers = layers
         self.config = config
@@ -87,11 +88,11 @@ class _Fit:
             masses=np.zeros(0),
             ids=np.zeros(0, np.int64),
             born=np.zeros(0, np.int32),
-            next_id=np.int64(0),
-            smoothing_length=np.float64(self.parameters.smoothing_length),
-            rest_density=np.float64(self.parameters.rest_density),
+            next_id=np.asarray(0, np.int64),
+            smoothing_length=np.asarray(self.parameters.smoothing_length),
+            rest_density=np.asarray(self.parameters.rest_density),
             buoyancy=np.zeros(3),
-            buoyancy_weight=np.float64(0.0),
+            buoyancy_weight=np.asarray(0.0),
             buoyancy_moment=np.zeros(3),
             buoyancy_square=np.zeros(3),
         )
@@ -200,14 +201,15 @@ class _Fit:
         if not self.config.learn_buoyancy or confidence.sum() <= 0.0:
             return record
         dt = self.scene.seconds_per_frame
-        acceleration = (velocities - record.velocities) / dt + self.config.drag * 0.5 * (velocities + record.velocities)
+        drag = self.config.drag  # of the end of the step, as the fluid takes it
+        acceleration = (velocities * (1.0 + drag * dt) - record.velocities) / dt
         observed = np.average(acceleration, axis=0, weights=confidence)
         weight = record.buoyancy_weight + 1.0
         moment = record.buoyancy_moment + observed
         return replace(
             record,
             buoyancy=moment / (weight + BUOYANCY_RIDGE),
-            buoyancy_weight=np.float64(weight),
+            buoyancy_weight=np.asarray(weight),
             buoyancy_moment=moment,
             buoyancy_square=record.buoyancy_square + observed * observed,
         )

@@ -7,7 +7,7 @@ physical ones; at the source both are born again as they were during the fit.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +15,16 @@ import numpy as np
 from backend.contract.errors import BackendError
 from backend.contract.job import PhysicalConfig
 from backend.fit.carry import as_fluid, carry, with_velocities
-from backend.fit.population import PER_PARTICLE, join, take
+from backend.fit.population import PER_PARTICLE, AnyRecord, join, take
+from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.physics import fluid as fluids
 from backend.reporting import Report
 
 FOOT = 0.2  # the source is the lowest fifth of the smoke's height
+SURFACE_DRAG = 3.0  # 1/s, where smoke borders on air: shears the edge of a plume
+VISCOSITY = 1.0  # 1/s
+VORTICITY_CONFINEMENT = 2.0  # 1/s
 REPLAYED = 24  # frames whose births the source repeats
 LIFETIME_REACH = 3.0  # heights of the smoke beyond which a particle is dropped
 
@@ -36,8 +40,8 @@ class Rollout:
 
 
 def run(
-    fluid: Sequence[PhysicalRecord],
-    seen: Sequence[VisualRecord],
+    fluid: Series[PhysicalRecord],
+    seen: Series[VisualRecord],
     config: PhysicalConfig,
     rollout: Rollout,
     report: Report,
@@ -60,6 +64,9 @@ def run(
         rest_density=float(record.rest_density),
         buoyancy=tuple(rollout.buoyancy * record.buoyancy),
         wind=rollout.wind or (0.0, 0.0, 0.0),
+        surface_drag=SURFACE_DRAG,
+        viscosity=VISCOSITY,
+        vorticity_confinement=VORTICITY_CONFINEMENT,
         colliders=rollout.colliders,
     )
     emitted = (_births(fluid), _births(seen))
@@ -79,7 +86,7 @@ def run(
     report.progress(rollout.num_frames, rollout.num_frames)
 
 
-def _births(records: Sequence[PhysicalRecord] | Sequence[VisualRecord]) -> list[PhysicalRecord | VisualRecord]:
+def _births(records: Series[AnyRecord]) -> list[AnyRecord]:
     """What was born at the foot of the smoke in each of the last frames of the fit."""
     born = []
     for frame in range(max(1, len(records) - REPLAYED), len(records)):
@@ -92,7 +99,7 @@ def _births(records: Sequence[PhysicalRecord] | Sequence[VisualRecord]) -> list[
     return born
 
 
-def _born_again(record, births: list, step: int):
+def _born_again(record: AnyRecord, births: list[AnyRecord], step: int) -> AnyRecord:
     """The record with the newborn of a fitted frame, one frame after the other, over and over."""
     if not births:
         return record

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,19 +11,20 @@ from backend.contract.job import VisualConfig
 from backend.fit.appearance import Appearance
 from backend.fit.carry import carry, with_velocities
 from backend.fit.scene import make_scene
+from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.reporting import Report
 
 
 def run(
-    layers: Sequence[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
+    layers: Series[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
     cameras: Cameras,
-    fluid: Sequence[PhysicalRecord],
+    fluid: Series[PhysicalRecord],
     config: VisualConfig,
     report: Report,
     *,
     seed: int,
-    done: Sequence[VisualRecord],
+    done: Series[VisualRecord],
 ) -> Iterator[VisualRecord]:
     """Yields the records of the frames behind those that are `done`."""
     scene = make_scene(layers, cameras)
