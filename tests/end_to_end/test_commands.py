@@ -96,7 +96,7 @@ def test_simulate_flows_around_a_collider(job: Path, tmp_path: Path) -> None:
     assert len(list((job / "simulation" / "vdb").glob("*.vdb"))) == 12
     refused = backend("simulate", "--job", job, "--frames", "2", "--collider", tmp_path / "nothing.obj")
     assert refused.returncode == 2
-    assert json.loads(refused.stdout.splitlines()[-1])["code"] == "collider_unreadable"
+    assert json.loads(refused.stdout.splitlines()[-1])["code"] == "collider_missing"
 
 
 def test_export_at_another_voxel_size(job: Path, tmp_path: Path) -> None:
