@@ -39,7 +39,7 @@ def _build(options: argparse.Namespace) -> None:
     smoke = scene_package.import_result(options.job, scene=scene)
     if options.relight is not None:
         smoke.data.materials[0].node_tree.nodes["Wildsmoke Smoke"].inputs["Relight"].default_value = options.relight
-    frame = options.frame if options.frame is not None else scene.frame_start + (2 * result.num_frames) // 3
+    frame = options.frame if options.frame is not None else scene.frame_start + (9 * result.num_frames) // 10
     scene.frame_set(min(max(frame, scene.frame_start), scene.frame_end))
     if options.blend is not None:
         saving.save_blend(options.blend)
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--job", type=Path, required=True, help="folder of a finished job")
     parser.add_argument("--blend", type=Path, help="the .blend to write")
     parser.add_argument("--preview", type=Path, help="the PNG to render with Cycles")
-    parser.add_argument("--frame", type=int, help="Blender's frame, from 1; two thirds through the clip by default")
+    parser.add_argument("--frame", type=int, help="Blender's frame, from 1; nine tenths through the clip by default")
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--longest-side", type=int, default=0, help="px of the preview; 0: the clip's own size")
     parser.add_argument("--relight", type=float, help="0: as filmed, 1: lit by the scene")

@@ -76,9 +76,7 @@ def run_operators(bpy, options: argparse.Namespace) -> dict:
 
     saving.save_blend(blend)
     plate = read_result(options.folder).background_plate
-    previews.render_preview(
-        scene, preview, frame=scene.frame_current, plate=None if plate is None else options.folder / plate
-    )
+    previews.render_preview(scene, preview, frame=scene.frame_current, plate=None if plate is None else options.folder / plate)
     return {
         "blender": bpy.app.version_string,
         "grids": sorted(grid.name for grid in evaluated.grids),

@@ -6,7 +6,6 @@ import json
 import os
 import resource
 import shutil
-import sys
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -15,9 +14,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from conftest import backend, settings
+from small_job import backend, settings
 
 STILL = [[1, 0, 0, 0], [0, 0, 1, -10], [0, -1, 0, 0], [0, 0, 0, 1]]
 FLAT = [[1, 0, 0, 0], [0, 0, 1, -10], [0, 0, 0, 0], [0, 0, 0, 1]]

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
+import os
+import subprocess
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from test_resume import assert_whole, digest
+from small_job import assert_whole, backend, digest, settings
 
 from backend.contract import events
 from backend.contract.result import read_result
+from backend.contract.running import process_start
 from backend.io.particles import read_particles
-from conftest import backend, settings
 
 CUBE = """
 v -0.3 -0.3 0.4\nv 0.3 -0.3 0.4\nv 0.3 0.3 0.4\nv -0.3 0.3 0.4\nv -0.3 -0.3 1\nv 0.3 -0.3 1\nv 0.3 0.3 1\nv -0.3 0.3 1
@@ -132,10 +132,18 @@ def test_the_number_of_threads_changes_no_byte(plume: Path, job: Path, tmp_path:
     assert digests[0] == digests[1]
 
 
+def test_two_backends_never_work_in_one_folder(job: Path, plume: Path) -> None:
+    (job / "running.json").write_text(json.dumps({"pid": os.getpid(), "start": process_start(os.getpid())}))
+    refused = backend("reconstruct", plume, "--job", job, *settings())
+    assert refused.returncode == 2
+    assert json.loads(refused.stdout.splitlines()[-1])["code"] == "job_running"
+    (job / "running.json").write_text(json.dumps({"pid": 2**22 + 12345, "start": "1"}))  # left by one that was killed
+    assert backend("reconstruct", plume, "--job", job, *settings()).returncode == 0
+    assert not (job / "running.json").exists()
+
+
 def test_end_of_input_stops_the_run(plume: Path, tmp_path: Path) -> None:
     """Blender died: standard input ends, the backend leaves soon and the job can go on."""
-    import subprocess
-    import time
 
     from test_resume import backend_command, environment  # same process helpers
 

@@ -2,59 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import random
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
-import cv2
-import h5py
-import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from backend.io.vdb import openvdb_module
-from conftest import backend, backend_command, environment, settings
+from small_job import assert_whole, backend, backend_command, digest, environment, settings
 
 NUM_KILLS = 20
-NOT_COMPARED = {"timing.json", "log.txt", "job.json", "running.json"}
-
-
-def digest(job: Path) -> dict[str, str]:
-    """The content of every file that a job leaves, but for times and the log."""
-    files = (path for path in sorted(job.rglob("*")) if path.is_file() and path.name not in NOT_COMPARED)
-    return {str(path.relative_to(job)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def assert_whole(job: Path) -> int:
-    """Every file under its own name can be read to its end. Returns how many there are."""
-    openvdb = openvdb_module()
-    assert openvdb is not None
-    count = 0
-    for path in job.rglob("*"):
-        if not path.is_file() or path.suffix == ".part":
-            continue
-        count += 1
-        match path.suffix:
-            case ".h5":
-                with h5py.File(path, "r") as file:
-                    assert "fingerprint" in file.attrs
-                    file.visititems(lambda _, item: item[()] if isinstance(item, h5py.Dataset) else None)
-            case ".npz":
-                with np.load(path) as arrays:
-                    assert all(arrays[name].dtype.kind in "fi" for name in arrays.files)
-            case ".vdb":
-                assert {grid.name for grid in openvdb.readAllGridMetadata(str(path))} >= {"density", "velocity"}
-                openvdb.read(str(path), "density")
-            case ".json":
-                json.loads(path.read_text())
-            case ".png":
-                assert cv2.imread(str(path)) is not None
-    return count
 
 
 @pytest.mark.slow
