@@ -52,7 +52,10 @@ class Matte:
         return self.background.at(index)[0]
 
     def clear_picture(self, frame: np.ndarray) -> np.ndarray:
-        """[h, w, 3] linear: the first frame without its smoke. A sky that was fitted says nothing of the ground below."""
+        """[h, w, 3] linear: the first frame without its smoke. A sky that was fitted says nothing of the ground below it,
+        so there the frame itself is taken."""
+        if self.background.plate is not None:
+            return self.plate(0)
         opacity = self.layer(frame, 0)[..., 3]
         size = 4 * max(1, self.radius) + 1
         share = cv2.dilate(np.minimum(20.0 * opacity, 1.0).astype(np.float32), np.ones((size, size), np.uint8))

@@ -30,8 +30,13 @@ RESULT = {
 }
 
 
+_SENDING = threading.Lock()  # two threads send; print() would write a line and its end apart
+
+
 def send(event: str, **values: object) -> None:
-    print(json.dumps({"event": event, **values}), flush=True)
+    with _SENDING:
+        sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
+        sys.stdout.flush()
 
 
 def start_time() -> str | None:
