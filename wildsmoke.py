@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
             return run([sys.executable, "-m", "tools.package", *rest])
         if command == "synth":
             set_up(BACKEND, BLENDER)
-            return run([BACKEND.interpreter, "-m", "synthetic", *rest])
+            return run([BACKEND.interpreter, "-m", "synthetic", *rest], cwd=None)
         set_up(BACKEND, BLENDER)
         return run([BACKEND.interpreter, "-m", "backend", *arguments], cwd=None)
     except SetupError as error:
