@@ -162,6 +162,9 @@ def on_load(_file: object, _unused: object = None) -> None:
 
     for scene in bpy.data.scenes:
         look(job_folder(scene.wildsmoke))
+    from .scene.volume import align_all
+
+    align_all()  # the file may have been saved by a Blender that draws grids elsewhere
 
 
 def register() -> None:

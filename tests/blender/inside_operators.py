@@ -441,3 +441,16 @@ def check_a_log_that_is_not_there_is_said(folder: Path) -> None:
     with registered():
         set_job(folder, "succeed")
         assert bpy.ops.wildsmoke.open_log() == {"CANCELLED"}
+
+
+def check_a_file_of_another_blender_is_aligned_when_it_is_opened(_folder: Path) -> None:
+    """A smoke that was saved with another version's shift gets this version's."""
+    from wildsmoke.addon.scene.volume import VOXEL_SIZE_PROPERTY
+
+    with registered() as session:
+        smoke = bpy.data.objects.new("Smoke", bpy.data.volumes.new("Smoke"))
+        smoke[VOXEL_SIZE_PROPERTY] = 0.5
+        smoke.delta_location = (9.0, 9.0, 9.0)
+        session.on_load(None)
+        expected = -0.25 if bpy.app.version < (5, 0, 0) else 0.0
+        assert all(abs(value - expected) < 1e-6 for value in smoke.delta_location), tuple(smoke.delta_location)
