@@ -113,12 +113,15 @@ def rendering(figures: dict[str, Any]) -> list[str]:
 
 
 def physics(figures: dict[str, Any]) -> list[str]:
-    names = [name for name in figures["results"][0] if name.endswith("_ms") or name == "particles"]
-    rows = [[f"{row[name]:.1f}" if name.endswith("_ms") else str(row[name]) for name in names] for row in figures["results"]]
+    names = [name for name in figures["results"][0] if name.endswith("_ms")]
+    rows = [
+        [str(row["particles"]), *(f"{row[name]['best']:.1f} / {row[name]['median']:.1f}" for name in names)]
+        for row in figures["results"]
+    ]
     return [
         "## Fluid\n",
-        f"`python -m benchmarks.physics_speed`: {figures['threads']} threads, load average {figures['load_average']}.\n",
-        table([name.replace("_", " ") for name in names], rows),
+        f"`python -m benchmarks.physics_speed`: {figures['threads']} threads, load average {figures['load_average']}; best / median.\n",
+        table(["particles", *(name.replace("_", " ") for name in names)], rows),
     ]
 
 
