@@ -23,6 +23,8 @@ from backend.render import splat as renderer
 SCALE_SHARE = 0.6  # standard deviation of a particle at birth, share of the mean spacing
 DEATH_SHARE = 0.02  # of a particle's own share of the smoke: below it a particle is spent
 BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fill detail
+RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in a frame
+FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel
@@ -112,6 +114,17 @@ class Appearance:
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 
+    def _with_room(self, record: VisualRecord, wanted: int) -> VisualRecord:
+        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting."""
+        lacking = wanted - (self.config.num_particles - len(record.positions))
+        if lacking <= 0:
+            return record
+        order = np.argsort(record.optical_masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(record.positions)))]
+        is_faint = record.optical_masses[order] < FAINT_SHARE * self.unit_mass
+        is_kept = np.ones(len(record.positions), bool)
+        is_kept[order[is_faint]] = False
+        return take(record, is_kept)
+
     def _births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
         """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
         view, layer = self.scene.views[frame], self.layers[frame]
@@ -122,7 +135,9 @@ class Appearance:
         mass = missing * pixel_mass(view, prior.center_depth)
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))
-        count = min(int(total / unit), self.config.num_particles - len(record.positions))
+        wanted = int(total / unit)
+        record = self._with_room(record, wanted)
+        count = min(wanted, self.config.num_particles - len(record.positions))
         points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=self.seed + 104729 * frame + 1)
         if len(points) == 0:
             return record
