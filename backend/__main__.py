@@ -38,7 +38,10 @@ def main(arguments: list[str] | None = None) -> int:
     stop = StopRequest()
     if options.command == "run":
         watch_standard_input(stop, sink)
-    return guarded(lambda: options.work(options, sink, stop), sink, getattr(options, "job", None))
+    try:
+        return guarded(lambda: options.work(options, sink, stop), sink, getattr(options, "job", None))
+    finally:
+        sink.close()
 
 
 def guarded(work: Callable[[], None], sink: EventSink, job: Path | None) -> int:

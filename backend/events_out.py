@@ -9,6 +9,7 @@ import time
 from typing import IO, Protocol
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from backend.contract import events
@@ -22,6 +23,10 @@ class EventSink(Protocol):
     """Takes the events of a run in order."""
 
     def send(self, event: events.Event) -> None: ...
+
+    def close(self) -> None:
+        """The command is over, whether or not it had a last event."""
+        ...
 
 
 class PipeSink:
@@ -45,6 +50,9 @@ class PipeSink:
             except (BrokenPipeError, ValueError):
                 self._is_closed = True  # nobody listens any more; the end of standard input will stop the work
 
+    def close(self) -> None:
+        """Every event was flushed when it was sent."""
+
 
 class TerminalSink:
     """A line a stage with its bar and time left."""
@@ -60,7 +68,6 @@ class TerminalSink:
             console=self._console,
         )
         self._task = None
-        self._progress.start()
 
     def send(self, event: events.Event) -> None:
         match event:
@@ -69,23 +76,27 @@ class TerminalSink:
             case events.Stage(skipped=True):
                 self._console.print(f"{event.name:<10} there already")
             case events.Stage():
+                self._progress.start()
                 self._task = self._progress.add_task(event.name, total=None, left="")
             case events.Progress() if self._task is not None:
                 left = "" if event.seconds_left is None else f"{event.seconds_left:.0f} s left"
                 self._progress.update(self._task, completed=event.step, total=event.total, left=left)
             case events.Warning():
-                self._console.print(f"[yellow]warning:[/yellow] {event.message}")
+                self._console.print(f"[yellow]warning:[/yellow] {escape(event.message)}")
             case events.Done():
                 self._progress.stop()
                 self._console.print(f"done in {event.seconds:.0f} s")
             case events.Error():
                 self._progress.stop()
-                self._console.print(f"[red]{event.message}[/red] {event.hint}")
+                self._console.print(f"[red]{escape(event.message)}[/red] {escape(event.hint)}")
             case events.CancelledEvent():
                 self._progress.stop()
                 self._console.print("cancelled; what was computed is kept, the next run resumes")
             case _:
                 return
+
+    def close(self) -> None:
+        self._progress.stop()
 
 
 class StopRequest:
