@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -50,6 +51,9 @@ def guarded(work: Callable[[], None], sink: EventSink, job: Path | None) -> int:
         work()
     except (Cancelled, KeyboardInterrupt):
         sink.send(events.CancelledEvent())
+        return EXIT_DONE
+    except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return EXIT_DONE
     except BackendError as error:
         write_log(job, f"{error.code}: {error}")
