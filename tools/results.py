@@ -120,7 +120,8 @@ def physics(figures: dict[str, Any]) -> list[str]:
     ]
     return [
         "## Fluid\n",
-        f"`python -m benchmarks.physics_speed`: {figures['threads']} threads, load average {figures['load_average']}; best / median.\n",
+        f"`python -m benchmarks.physics_speed`: {figures['threads']} threads, load average {figures['load_average']}; "
+        "best / median.\n",
         table(["particles", *(name.replace("_", " ") for name in names)], rows),
     ]
 
