@@ -24,6 +24,7 @@ from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord
 from backend.geometry.camera import View
 from backend.physics import fluid as fluids
+from backend.physics.buoyancy import solve_buoyancy
 from backend.physics.interpolate import interpolate_velocity, smooth
 from backend.render import splat as renderer
 from backend.render.gaussians import isotropic
@@ -109,7 +110,8 @@ class _Fit:
             return self._births(record, frame)
         dt = self.scene.seconds_per_frame
         parameters = replace(self.parameters, buoyancy=tuple(record.buoyancy))
-        predicted = fluids.step(as_fluid(record), parameters, dt)[0].positions
+        state, taken = fluids.step(as_fluid(record), parameters, dt)
+        predicted = state.positions
         wanted, confidence = self._observed(record.positions, frame - 1)
         gain = self.config.flow_gain * confidence[:, None]
         lack = _sideways(record.positions + wanted - predicted, self.scene.views[frame])
@@ -117,7 +119,7 @@ class _Fit:
         moved = self._corrected(replace(record, positions=positions), frame)
         moved = depth_prior.contain(moved, self._prior(frame), self.scene.views[frame], share=CONTAINMENT)
         velocities = (moved - record.positions) / dt
-        learned = self._learn_buoyancy(record, velocities, confidence)
+        learned = self._learn_buoyancy(record, velocities, confidence, taken.substeps)
         current = replace(learned, positions=moved, velocities=velocities)
         return self._births(self._weighed(current, frame), frame)
 
@@ -196,14 +198,20 @@ class _Fit:
             born=np.full(len(points), frame),
         )
 
-    def _learn_buoyancy(self, record: PhysicalRecord, velocities: np.ndarray, confidence: np.ndarray) -> PhysicalRecord:
+    def _learn_buoyancy(
+        self, record: PhysicalRecord, velocities: np.ndarray, confidence: np.ndarray, substeps: int
+    ) -> PhysicalRecord:
         """The mean force that the velocities of the optimised positions ask for, all frames so far together."""
         if not self.config.learn_buoyancy or confidence.sum() <= 0.0:
             return record
-        dt = self.scene.seconds_per_frame
-        drag = self.config.drag  # of the end of the step, as the fluid takes it
-        acceleration = (velocities * (1.0 + drag * dt) - record.velocities) / dt
-        observed = np.average(acceleration, axis=0, weights=confidence)
+        observed = solve_buoyancy(
+            record.velocities,
+            velocities,
+            confidence,
+            self.scene.seconds_per_frame,
+            drag=self.config.drag,
+            substeps=substeps,
+        ).vector
         weight = record.buoyancy_weight + 1.0
         moment = record.buoyancy_moment + observed
         return replace(
