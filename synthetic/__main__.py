@@ -5,6 +5,8 @@
     python3 wildsmoke.py synth simulate SCENE --out DIR [--preset bench]
     python3 wildsmoke.py synth render SCENE --out DIR [--preset bench] [--frames A:B] [--views ...] [--smoke DIR] ...
     python3 wildsmoke.py synth assemble SCENE --out DIR [--preset bench]
+    python3 wildsmoke.py synth ship SCENE --out DIR [--to DIR]         the small set of a scene that ships in synthetic/bench
+    python3 wildsmoke.py synth pack SCENE --out DIR [--to DIR]         its last step, from a scene that is rendered
     python3 wildsmoke.py synth demo --out DIR                          the bundled clip and its truth
 
 Every step goes on where it was interrupted. The Pythons are .venv/backend and .venv/blender of the checkout;
@@ -40,12 +42,14 @@ def main(arguments: list[str]) -> int:
             return _list()
         if command == "render":
             return _run(pythons.blender_python, "synthetic.render", rest)
-        if command in ("simulate", "assemble"):
+        if command in ("simulate", "assemble", "pack"):
             return _run(pythons.backend_python, "synthetic.record", [command, *rest])
         if command == "make":
             return _make(pythons, rest)
         if command == "demo":
             return _make(pythons, ["demo", "--preset", "demo", *rest])
+        if command == "ship":
+            return _ship(pythons, rest)
         raise BackendError("unknown_command", f'There is no command "{command}".', hint="See `synth --help`.")
     except BackendError as error:
         print(f"synthetic: {error}", file=sys.stderr)
@@ -72,12 +76,34 @@ def _make(pythons: argparse.Namespace, arguments: list[str]) -> int:
     parser.add_argument("--preset", choices=sorted(PRESETS), default="bench")
     given = parser.parse_args(arguments)
     common = [given.scene, "--out", str(given.out), "--preset", given.preset]
-    for python, module, extra in (
-        (pythons.backend_python, "synthetic.record", ["simulate"]),
-        (pythons.blender_python, "synthetic.render", []),
-        (pythons.backend_python, "synthetic.record", ["assemble"]),
-    ):
-        code = _run(python, module, [*extra, *common])
+    return _in_turn(
+        (pythons.backend_python, "synthetic.record", ["simulate", *common]),
+        (pythons.blender_python, "synthetic.render", common),
+        (pythons.backend_python, "synthetic.record", ["assemble", *common]),
+    )
+
+
+def _ship(pythons: argparse.Namespace, arguments: list[str]) -> int:
+    """As _make, but only what ships is rendered, and packed in the end."""
+    parser = argparse.ArgumentParser(prog="synth ship", description="Simulate, render and pack what ships of a scene.")
+    parser.add_argument("scene")
+    parser.add_argument("--out", type=Path, required=True, help="where the images lie while they are made")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="bench")
+    parser.add_argument("--to", type=Path, help="the folder that holds a folder of each scene, by default synthetic/bench")
+    given = parser.parse_args(arguments)
+    common = [given.scene, "--out", str(given.out), "--preset", given.preset]
+    target = ["--to", str(given.to)] if given.to else []
+    return _in_turn(
+        (pythons.backend_python, "synthetic.record", ["simulate", *common]),
+        (pythons.blender_python, "synthetic.render", [*common, "--shipped"]),
+        (pythons.backend_python, "synthetic.record", ["pack", *common, *target]),
+    )
+
+
+def _in_turn(*steps: tuple[Path, str, list[str]]) -> int:
+    """The exit code of the first step that fails."""
+    for python, module, arguments in steps:
+        code = _run(python, module, arguments)
         if code != EXIT_DONE:
             return code
     return EXIT_DONE

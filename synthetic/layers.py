@@ -22,10 +22,11 @@ class Layer(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
-    """What an image costs. samples per pixel; bounces of light in all and inside smoke; step_rate: ray marching
-    steps per voxel, 1 (only where is_biased); threads: 0 for all."""
+    """What an image costs. samples per pixel, opacity_samples: of the opacity of smoke alone; bounces of light in all and
+    inside smoke; step_rate: ray marching steps per voxel, 1 (only where is_biased); threads: 0 for all."""
 
     samples: int
+    opacity_samples: int = 16
     is_denoised: bool = True
     is_biased: bool = True
     bounces: int = 4

@@ -20,6 +20,7 @@ INPUT_FOLDER = "input"
 TRUTH_FOLDER = "truth"
 SMOKE_FOLDER = "smoke"
 INPUT_VIEW = "input"
+SHIPPED_EVERY = {"input": 1, "nvs": 3, "side": 9, "back": 9}  # frames
 TEST_VIEWS = {"nvs": 0.0, "side": 120.0, "back": 180.0}  # degrees that the camera is turned from the first frame's
 
 
@@ -58,6 +59,18 @@ def plan_images(preset: Preset, *, views: tuple[str, ...] | None = None) -> list
             if is_first:
                 images += [_image(preset, view, layer, frame) for layer in (Layer.PLATE, Layer.DEPTH)]
     return images
+
+
+def plan_shipped(preset: Preset) -> list[Image]:
+    """The images of the set that ships: the clip's seen frames, and the smoke alone at the rates of SHIPPED_EVERY."""
+    num_seen = preset.num_frames - preset.num_future
+    kept = {view: every for view, every in SHIPPED_EVERY.items() if view in preset.views}
+    return [
+        image
+        for image in plan_images(preset)
+        if (image.layer is Layer.CLIP and image.frame < num_seen)
+        or (image.layer is Layer.SMOKE and image.frame % kept[image.view] == 0)
+    ]
 
 
 def first_frames(start: int, stop: int) -> tuple[int, ...]:

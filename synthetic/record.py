@@ -1,4 +1,5 @@
-"""The steps that run in the backend's environment: `simulate` writes the smoke, `assemble` finishes a rendered scene."""
+"""The steps that run in the backend's environment: `simulate` writes the smoke, `assemble` finishes a rendered scene, `pack`
+makes the small set of it that ships."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from synthetic.plan import SMOKE_FOLDER
 from synthetic.presets import PRESETS, Preset
 from synthetic.progress import Progress
 from synthetic.scenes import SCENES, SmokeScene
+from synthetic.shipped import SHIPPED_FOLDER, pack
 from synthetic.solver.recording import Recording, record
 
 
@@ -29,10 +31,11 @@ def recording_of(scene: SmokeScene, preset: Preset) -> Recording:
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="synth")
-    parser.add_argument("step", choices=("simulate", "assemble"))
+    parser.add_argument("step", choices=("simulate", "assemble", "pack"))
     parser.add_argument("scene")
     parser.add_argument("--out", type=Path, required=True, help="folder of this scene")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="bench")
+    parser.add_argument("--to", type=Path, default=SHIPPED_FOLDER, help="for pack: the folder that holds a folder of each scene")
     given = parser.parse_args(arguments)
     try:
         if given.scene not in SCENES:
@@ -40,6 +43,9 @@ def main(arguments: list[str]) -> int:
         scene, preset = SCENES[given.scene], PRESETS[given.preset]
         if given.step == "assemble":
             print(assemble(given.scene, given.out, preset))
+            return EXIT_DONE
+        if given.step == "pack":
+            print(pack(given.scene, given.out, preset, given.to / given.scene))
             return EXIT_DONE
         progress = Progress(label=f"simulate {scene.name}", total=preset.num_frames)
         record(recording_of(scene, preset), given.out / SMOKE_FOLDER, progress=progress.step)

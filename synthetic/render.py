@@ -35,6 +35,7 @@ from synthetic.plan import (
     Image,
     first_frames,
     plan_images,
+    plan_shipped,
     view_cameras,
 )
 from synthetic.presets import PRESETS, Preset
@@ -55,7 +56,8 @@ class RenderOrder:
     """What to render. frames: start and stop, or all; views: of "input", "nvs", "side", "back", or all.
 
     smoke_folder: VDB files in order of name, by default DIR/smoke; blend_file: a static scene in place of ours;
-    wait_seconds: how long to wait for a smoke file that a simulation at work has not written yet.
+    only_shipped: only the images of the set that ships; wait_seconds: how long to wait for a smoke file that a simulation
+    at work has not written yet.
     """
 
     scene: str
@@ -66,6 +68,7 @@ class RenderOrder:
     views: tuple[str, ...] | None = None
     smoke_folder: Path | None = None
     blend_file: Path | None = None
+    only_shipped: bool = False
     wait_seconds: float = 0.0
 
 
@@ -164,7 +167,11 @@ def _ordered(order: RenderOrder) -> list[Image]:
             hint=f"Choose of {', '.join(order.preset.views)}.",
         )
     start, stop = _frame_range(order)
-    images = [image for image in plan_images(order.preset, views=order.views) if start <= image.frame < stop]
+    images = plan_images(order.preset, views=order.views)
+    if order.only_shipped:
+        shipped = set(plan_shipped(order.preset))
+        images = [image for image in images if image in shipped]
+    images = [image for image in images if start <= image.frame < stop]
     early = set(first_frames(start, stop))
     return sorted(images, key=lambda image: image.frame not in early)
 
@@ -242,6 +249,7 @@ def parse_arguments(arguments: Sequence[str]) -> RenderOrder:
     parser.add_argument("--views", help="comma-separated, of input,nvs,side,back; by default all")
     parser.add_argument("--smoke", type=Path, help="folder of VDB files in place of DIR/smoke")
     parser.add_argument("--scene-file", "--scene", type=Path, help="a .blend in place of our scene")
+    parser.add_argument("--shipped", action="store_true", help="only the images of the set that ships")
     parser.add_argument("--samples", type=int, help="in place of the preset's")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--wait", type=float, default=0.0, help="seconds to wait for smoke that is still being simulated")
@@ -257,6 +265,7 @@ def parse_arguments(arguments: Sequence[str]) -> RenderOrder:
         views=tuple(given.views.split(",")) if given.views else None,
         smoke_folder=given.smoke.absolute() if given.smoke else None,
         blend_file=given.scene_file.absolute() if given.scene_file else None,
+        only_shipped=given.shipped,
         wait_seconds=given.wait,
     )
 

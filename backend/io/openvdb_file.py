@@ -58,6 +58,27 @@ def write_grids(module: ModuleType, path: Path, grids: dict[str, np.ndarray], tr
         file.write(_with_derived_uuid(data))
 
 
+def read_grid(module: ModuleType, path: Path, name: str) -> tuple[np.ndarray, list[list[float]]]:
+    """Values float32 [X, Y, Z] or [X, Y, Z, 3] of the box of active voxels, and its 4x4 transform (row vectors), index -> m.
+
+    Raises RuntimeError or KeyError (by version of the module) where the file or the grid is missing.
+    """
+    if not path.is_file():  # some versions of the module end the process otherwise
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    grid = module.read(str(path), name)
+    low, high = grid.evalActiveVoxelBoundingBox() if grid.activeVoxelCount() else ((0, 0, 0), (0, 0, 0))
+    shape = [b - a + 1 for a, b in zip(low, high, strict=True)]
+    is_vector = grid.valueTypeName.startswith("vec3")
+    values = np.zeros((*shape, 3) if is_vector else shape, np.float32)
+    grid.copyToArray(values, ijk=tuple(low))
+    corner = np.array(grid.transform.indexToWorld(tuple(low)))
+    rows = []
+    for axis in range(3):
+        index = [place + (other == axis) for other, place in enumerate(low)]
+        rows.append([*(np.array(grid.transform.indexToWorld(tuple(index))) - corner), 0.0])
+    return values, [*rows, [*corner, 1.0]]
+
+
 def _grid(module: ModuleType, name: str, array: np.ndarray, transform: list[list[float]]) -> object:
     is_vector = array.ndim == 4
     grid = module.Vec3SGrid() if is_vector else module.FloatGrid()

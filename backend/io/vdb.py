@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
@@ -51,6 +52,43 @@ def write_vdb(
             openvdb_file.write_grids(module, part, arrays, transform)
         else:
             _write_elsewhere(writer_python(), part, arrays, transform)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseGrid:
+    """values: [X, Y, Z] or [X, Y, Z, 3]; voxel (i, j, k) has its centre at origin + voxel_size (i, j, k), m."""
+
+    values: np.ndarray
+    voxel_size: float
+    origin: tuple[float, float, float]
+
+
+def read_vdb(path: str | Path, name: str) -> DenseGrid:
+    """One grid of a VDB file, cropped to its active voxels (one voxel of background where there is none).
+
+    Raises BackendError where the file or the grid is missing, the voxels are no cubes along the axes, or this Python has no
+    OpenVDB module.
+    """
+    module = openvdb_module()
+    if module is None:
+        raise BackendError(
+            "openvdb_missing",
+            f"OpenVDB's Python module was not found for Python {sys.version_info.major}.{sys.version_info.minor}.",
+            hint=f"Set {PATH_VARIABLE} to a folder that holds the module for this version of Python.",
+        )
+    try:
+        values, transform = openvdb_file.read_grid(module, Path(path), name)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise BackendError(
+            "vdb_unreadable", f"{path} has no grid {name} that can be read: {error}.", hint="Give a whole VDB file."
+        ) from error
+    matrix = np.array(transform)
+    size = matrix[0, 0]
+    if not (size > 0 and np.allclose(matrix[:3, :3], size * np.eye(3), atol=1e-6 * abs(size))):
+        raise BackendError("vdb_turned", f"The voxels of {path} are no cubes along the axes.", hint="Resample the grid first.")
+    return DenseGrid(
+        values=values, voxel_size=float(size), origin=(float(matrix[3, 0]), float(matrix[3, 1]), float(matrix[3, 2]))
+    )
 
 
 def check_writable() -> str:

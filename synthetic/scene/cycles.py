@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import bpy
+import numpy as np
 
 from synthetic.layers import Layer, Quality
 from synthetic.scene import shading
 from synthetic.scene.pixels import encode_png, read_exr
+from synthetic.scene.smoke import smoke_window
 
-_OPACITY_SAMPLES = 16
+_OPACITY_SAMPLES = "wildsmoke_opacity_samples"  # property of the scene; the other settings are Cycles' own
 
 
 def set_quality(quality: Quality, *, seed: int) -> None:
@@ -24,6 +27,7 @@ def set_quality(quality: Quality, *, seed: int) -> None:
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.samples = quality.samples
+    scene[_OPACITY_SAMPLES] = quality.opacity_samples
     cycles.seed = seed
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = quality.is_denoised
@@ -51,20 +55,17 @@ def set_quality(quality: Quality, *, seed: int) -> None:
 
 def render_image(path: Path, layer: Layer) -> None:
     """Render the scene as it stands to a file that is whole or absent."""
-    scene = bpy.context.scene
-    scene.render.film_transparent = layer in (Layer.SMOKE, Layer.DEPTH)
-    for item in scene.objects:
-        if item.type == "MESH":
-            item.is_holdout = layer is Layer.SMOKE
     # The process number keeps two workers apart, should a claim ever fail on a shared folder.
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     if layer is Layer.SMOKE:
-        _render_smoke(part)
+        part.write_bytes(encode_png(render_pixels(layer)))
     elif layer is Layer.DEPTH:
+        _prepare(layer)
         with _depth_instead_of_light():
-            _render_exr(part, color_depth="32")
+            _render_exr(part)
     else:
-        settings = scene.render.image_settings
+        _prepare(layer)
+        settings = bpy.context.scene.render.image_settings
         settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGB", "8"
         settings.compression = 60
         _render(part)
@@ -73,23 +74,58 @@ def render_image(path: Path, layer: Layer) -> None:
     os.replace(part, path)
 
 
-def _render_smoke(part: Path) -> None:
-    """Light and opacity in two renders: Cycles draws lots for the opacity of what scatters, and the denoiser leaves it
-    alone; of what only absorbs, the opacity is integrated along the ray."""
-    light, dark = part.with_name(part.name + ".light.exr"), part.with_name(part.name + ".dark.exr")
-    _render_exr(light, color_depth="32")
-    with _absorption_instead_of_light():
-        _render_exr(dark, color_depth="32")
-    image = read_exr(light)
-    image[..., 3] = read_exr(dark)[..., 3]
-    part.write_bytes(encode_png(image))
-    light.unlink()
-    dark.unlink()
+def render_pixels(layer: Layer, *, parts: tuple[bool, ...] = (False, True)) -> np.ndarray:
+    """[H, W, 4] linear light and opacity of the scene as it stands.
+
+    Of smoke, light (False of `parts`) and opacity (True) are two renders: Cycles draws lots for the opacity of what
+    scatters, and the denoiser leaves it alone; of what only absorbs, the opacity is integrated along the ray.
+    """
+    _prepare(layer)
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "image.exr")
+        if layer is not Layer.SMOKE:
+            _render_exr(path)
+            return read_exr(path)
+        image = None
+        with _smoke_only():
+            for is_opacity in parts:
+                with _absorption_instead_of_light() if is_opacity else nullcontext():
+                    _render_exr(path)
+                found = read_exr(path)
+                if image is None:
+                    image = found
+                else:
+                    image[..., 3] = found[..., 3]
+        assert image is not None
+        return image
 
 
-def _render_exr(path: Path, *, color_depth: str) -> None:
+def _prepare(layer: Layer) -> None:
+    scene = bpy.context.scene
+    scene.render.film_transparent = layer in (Layer.SMOKE, Layer.DEPTH)
+    for item in scene.objects:
+        if item.type == "MESH":
+            item.is_holdout = layer is Layer.SMOKE
+    shading.show_texture(layer is not Layer.SMOKE)
+
+
+@contextmanager
+def _smoke_only() -> Iterator[None]:
+    """Render nothing but the part of the image that the smoke's box covers; the rest is empty anyway."""
+    render = bpy.context.scene.render
+    low, high = smoke_window(bpy.context.scene.camera)
+    render.use_border, render.use_crop_to_border = True, False
+    render.border_min_x, render.border_min_y = low
+    render.border_max_x, render.border_max_y = high
+    try:
+        yield
+    finally:
+        render.use_border = False
+
+
+def _render_exr(path: Path) -> None:
     settings = bpy.context.scene.render.image_settings
-    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", color_depth
+    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
     settings.exr_codec = "ZIP"
     _render(path)
 
@@ -105,7 +141,7 @@ def _absorption_instead_of_light() -> Iterator[None]:
     """The smoke swallows all light: alpha is 1 - transmittance, and only the ray marching's jitter is left to average."""
     cycles = bpy.context.scene.cycles
     kept_settings = cycles.samples, cycles.use_denoising, cycles.max_bounces
-    cycles.samples, cycles.use_denoising, cycles.max_bounces = _OPACITY_SAMPLES, False, 0
+    cycles.samples, cycles.use_denoising, cycles.max_bounces = bpy.context.scene[_OPACITY_SAMPLES], False, 0
     volumes = [item.data for item in bpy.context.scene.objects if item.type == "VOLUME"]
     kept = [volume.materials[0] for volume in volumes]
     for volume in volumes:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import bpy
+from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
 from synthetic.scene import shading
@@ -12,6 +14,8 @@ from synthetic.scene import shading
 _ALBEDO = (0.9, 0.885, 0.87)
 _ANISOTROPY = 0.25  # smoke throws more light forward than back
 _NAME = "smoke"
+_MARGIN = 4.0  # px around the smoke's box
+_CORNER = (0.0, 0.0), (0.1, 0.1)
 
 
 def show_smoke(path: Path | None) -> None:
@@ -41,3 +45,40 @@ def _misplacement(volume: bpy.types.Volume) -> Vector:
     if not len(volume.grids):
         return Vector()
     return volume.grids[0].matrix_object.to_3x3() @ Vector((0.5, 0.5, 0.5))
+
+
+def smoke_window(camera: bpy.types.Object) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Left bottom and right top of what the shown smoke's box covers in the image, each 0..1 and a few pixels wider;
+    the whole image where the box reaches behind the camera, and a small corner where there is no smoke in view."""
+    item, scene = bpy.data.objects[_NAME], bpy.context.scene
+    bpy.context.view_layer.update()
+    corners = [] if item.hide_render else _corners(item)
+    if not corners:
+        return _CORNER
+    seen = [world_to_camera_view(scene, camera, item.matrix_world @ corner) for corner in corners]
+    if min(point.z for point in seen) <= camera.data.clip_start:
+        return (0.0, 0.0), (1.0, 1.0)
+    low, high = [], []
+    for axis, size in enumerate((scene.render.resolution_x, scene.render.resolution_y)):
+        margin = _MARGIN / size
+        low.append(min(max(min(point[axis] for point in seen) - margin, 0.0), 1.0))
+        high.append(min(max(max(point[axis] for point in seen) + margin, 0.0), 1.0))
+    if min(b - a for a, b in zip(low, high, strict=True)) <= 0.0:
+        return _CORNER
+    return (low[0], low[1]), (high[0], high[1])
+
+
+def _corners(item: bpy.types.Object) -> list[Vector]:
+    """Corners of the box around the density, object coordinates, m; empty where there is none. An object's own box is
+    that of all grids, and velocity fills the whole air."""
+    try:
+        bpy.utils.expose_bundled_modules()
+        import openvdb
+    except ImportError:  # a Blender whose OpenVDB module is not bundled: a larger window, the same image
+        return [Vector(corner) for corner in item.bound_box]
+    grid = openvdb.read(item.data.filepath, "density")
+    if grid.activeVoxelCount() == 0:
+        return []
+    low, high = grid.evalActiveVoxelBoundingBox()
+    spans = [(a - 1, b + 2) for a, b in zip(low, high, strict=True)]  # values reach one voxel beyond their centre
+    return [Vector(grid.transform.indexToWorld(index)) for index in itertools.product(*spans)]
