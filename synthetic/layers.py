@@ -30,6 +30,6 @@ class Quality:
     is_denoised: bool = True
     is_biased: bool = True
     bounces: int = 4
-    volume_bounces: int = 4
+    volume_bounces: int = 8
     step_rate: float = 1.0
     threads: int = 0

@@ -42,7 +42,7 @@ PRESETS = {
         steps_per_frame=3,
         volumes_every=10,
         orbit=_SWEEP,
-        quality=Quality(samples=200, volume_bounces=8, bounces=6),
+        quality=Quality(samples=200),
     ),
     # The same nine seconds and the same sweep, every second frame at a sixth of the size.
     "bench": Preset(
@@ -68,7 +68,7 @@ PRESETS = {
         steps_per_frame=2,
         volumes_every=15,
         orbit=_SWEEP,
-        quality=Quality(samples=8, volume_bounces=3, bounces=3),
+        quality=Quality(samples=8, opacity_samples=8),
         smoke_every=15,
     ),
     # For tests: the same sweep in a few coarse frames.
@@ -82,7 +82,7 @@ PRESETS = {
         steps_per_frame=6,
         volumes_every=4,
         orbit=_SWEEP,
-        quality=Quality(samples=4, volume_bounces=2, bounces=2),
+        quality=Quality(samples=4, opacity_samples=4),
     ),
     # The bundled clip: a tripod at the sweep's first place.
     "demo": Preset(
@@ -95,7 +95,7 @@ PRESETS = {
         steps_per_frame=2,
         volumes_every=12,
         orbit=Orbit(target=(0.6, 0.2, 6.4), distance=26.0, half_height=7.4, azimuth_stop=-105.0),
-        quality=Quality(samples=8, volume_bounces=3, bounces=3),
+        quality=Quality(samples=8, opacity_samples=8),
         smoke_every=12,
         views=("input", "side"),
     ),

@@ -56,8 +56,8 @@ class RenderOrder:
     """What to render. frames: start and stop, or all; views: of "input", "nvs", "side", "back", or all.
 
     smoke_folder: VDB files in order of name, by default DIR/smoke; blend_file: a static scene in place of ours;
-    only_shipped: only the images of the set that ships; wait_seconds: how long to wait for a smoke file that a simulation
-    at work has not written yet.
+    only_shipped: only the images of the set that ships; seed: of the noise, by default the scene's; wait_seconds: how long
+    to wait for a smoke file that a simulation at work has not written yet.
     """
 
     scene: str
@@ -69,6 +69,7 @@ class RenderOrder:
     smoke_folder: Path | None = None
     blend_file: Path | None = None
     only_shipped: bool = False
+    seed: int | None = None
     wait_seconds: float = 0.0
 
 
@@ -108,7 +109,11 @@ def build_scene(order: RenderOrder) -> None:
         if bpy.context.scene.world is None:
             add_black_world()
     # One seed for all frames: what does not change looks the same in all of them, noise included.
-    set_quality(order.preset.quality, seed=SCENES[order.scene].seed)
+    set_quality(order.preset.quality, seed=_seed(order))
+
+
+def _seed(order: RenderOrder) -> int:
+    return SCENES[order.scene].seed if order.seed is None else order.seed
 
 
 def _render_one(order: RenderOrder, image: Image, smoke: _SmokeFiles) -> float | None:
@@ -214,7 +219,7 @@ def describe(order: RenderOrder) -> dict[str, object]:
         "preset": order.preset_name,
         "blender": bpy.app.version_string,
         "machine": platform.machine(),
-        "seed": SCENES[order.scene].seed,
+        "seed": _seed(order),
         "quality": {name: getattr(quality, name) for name in quality.__slots__ if name != "threads"},
         "own_smoke": order.smoke_folder is not None,
         "own_scene": order.blend_file.name if order.blend_file else None,
@@ -251,11 +256,14 @@ def parse_arguments(arguments: Sequence[str]) -> RenderOrder:
     parser.add_argument("--scene-file", "--scene", type=Path, help="a .blend in place of our scene")
     parser.add_argument("--shipped", action="store_true", help="only the images of the set that ships")
     parser.add_argument("--samples", type=int, help="in place of the preset's")
+    parser.add_argument("--seed", type=int, help="of the noise, in place of the scene's")
+    parser.add_argument("--plain", action="store_true", help="leave the noise in")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--wait", type=float, default=0.0, help="seconds to wait for smoke that is still being simulated")
     given = parser.parse_args(list(arguments))
     preset = PRESETS[given.preset]
     quality = replace(preset.quality, threads=given.threads, samples=given.samples or preset.quality.samples)
+    quality = replace(quality, is_denoised=quality.is_denoised and not given.plain)
     return RenderOrder(
         scene=given.scene,
         folder=given.out.absolute(),
@@ -266,6 +274,7 @@ def parse_arguments(arguments: Sequence[str]) -> RenderOrder:
         smoke_folder=given.smoke.absolute() if given.smoke else None,
         blend_file=given.scene_file.absolute() if given.scene_file else None,
         only_shipped=given.shipped,
+        seed=given.seed,
         wait_seconds=given.wait,
     )
 

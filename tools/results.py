@@ -41,6 +41,8 @@ def page() -> str:
         *forecast(load("forecast_demo"), load("forecast_plume")),
         *rendering(load("render_speed")),
         *physics(load("physics_speed")),
+        *cycles_trade(load("cycles_trade")),
+        *blender_parity(load("blender_parity")),
     ]
     return "\n".join(parts)
 
@@ -140,6 +142,66 @@ def physics(figures: dict[str, Any]) -> list[str]:
         f"`python -m benchmarks.physics_speed`: {figures['threads']} threads, load average {figures['load_average']}; "
         "best / median.\n",
         table(["particles", *(name.replace("_", " ") for name in names)], rows),
+    ]
+
+
+def cycles_trade(cases: list[dict[str, Any]]) -> list[str]:
+    samples = [case for case in cases if case["axis"] == "samples" and case["layer"] != "opacity"]
+    rows = [
+        [layer, version, "yes" if is_biased else "no", str(number), *cells(found)]
+        for layer in ("clip", "smoke")
+        for version in sorted({case["blender"] for case in samples})
+        for is_biased in (True, False)
+        for number in sorted({case["samples"] for case in samples})
+        if (
+            found := [
+                case
+                for case in samples
+                if (case["layer"], case["blender"], case["is_biased"], case["samples"]) == (layer, version, is_biased, number)
+            ]
+        )
+    ]
+    opacity = [
+        [case["blender"], str(case["samples"]), f"{case['cpu_seconds']:.1f}", f"{case['smoke_error']:.4f}"]
+        for case in cases
+        if case["layer"] == "opacity"
+    ]
+    others = [
+        [axis, f"{case[key]:g}", case["layer"], str(case["samples"]), f"{case['cpu_seconds']:.1f}", f"{case['smoke_error']:.4f}"]
+        for axis, key in (("bounces", "bounces"), ("step rate", "step_rate"), ("resolution", "scale"))
+        for layer in ("clip", "smoke")
+        for case in sorted((c for c in cases if c["axis"] == axis and c["layer"] == layer), key=lambda c: c[key])
+        if case["blender"].startswith("5")
+    ]
+    return [
+        "## What an image of the benchmark costs in Cycles\n",
+        "`python -m benchmarks.cycles_trade`, one frame of `puff_front` at 180x320, against 2048 samples without bias or "
+        "denoiser, with 16 bounces. Error: RMS in the smoke, sRGB 0..1; seconds of one processor. Read in "
+        "docs/synthetic.md what follows from it.\n",
+        "![error over seconds](images/cycles_trade.png)\n",
+        table(["layer", "Blender", "biased", "samples", "s plain", "error plain", "s denoised", "error denoised"], rows),
+        "The opacity of smoke alone, never denoised:\n",
+        table(["Blender", "samples", "s", "error"], opacity),
+        "One setting at a time, Blender 5.2, biased, denoised; resolution is brought back to 180x320 before it is compared:\n",
+        table(["what", "value", "layer", "samples", "s", "error"], others),
+    ]
+
+
+def cells(cases: list[dict[str, Any]]) -> list[str]:
+    """Seconds and error of the image as it is and denoised; a dash where it was not made."""
+    made = {case["is_denoised"]: (f"{case['cpu_seconds']:.1f}", f"{case['smoke_error']:.4f}") for case in cases}
+    return [text for is_denoised in (False, True) for text in made.get(is_denoised, ("-", "-"))]
+
+
+def blender_parity(figures: dict[str, Any]) -> list[str]:
+    names = ("layer", "between", "difference", "noise", "blocks")
+    rows = [[str(row[name]) for name in names] for row in figures["rows"]]
+    return [
+        "## The same image in every Blender\n",
+        f"`python -m benchmarks.blender_parity`: one frame, {figures['samples']} samples, not denoised, twice in each with other "
+        "random numbers. RMS of the difference of their means, of the noise expected in it, and of the difference in blocks of "
+        "10x10 pixels; sRGB 0..1, depth in units of 100 m.\n",
+        table(["layer", "between", "difference", "noise", "in blocks"], rows),
     ]
 
 

@@ -61,7 +61,7 @@ def write_grids(module: ModuleType, path: Path, grids: dict[str, np.ndarray], tr
 def read_grid(module: ModuleType, path: Path, name: str) -> tuple[np.ndarray, list[list[float]]]:
     """Values float32 [X, Y, Z] or [X, Y, Z, 3] of the box of active voxels, and its 4x4 transform (row vectors), index -> m.
 
-    Raises RuntimeError or KeyError (by version of the module) where the file or the grid is missing.
+    Raises OSError, RuntimeError or LookupError (by version of the module) where the file or the grid is missing or broken.
     """
     if not path.is_file():  # some versions of the module end the process otherwise
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))

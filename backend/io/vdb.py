@@ -78,7 +78,7 @@ def read_vdb(path: str | Path, name: str) -> DenseGrid:
         )
     try:
         values, transform = openvdb_file.read_grid(module, Path(path), name)
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, LookupError) as error:
         raise BackendError(
             "vdb_unreadable", f"{path} has no grid {name} that can be read: {error}.", hint="Give a whole VDB file."
         ) from error

@@ -193,3 +193,44 @@ def test_a_backend_process_ends_without_a_word(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=CHECKOUT, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    grids = sample_grids()
+    vdb.write_vdb(tmp_path / "a.vdb", grids, **PLACE)
+    for name, expected in grids.items():
+        found = vdb.read_vdb(tmp_path / "a.vdb", name)
+        assert found.voxel_size == pytest.approx(0.25)
+        start = [round((a - b) / 0.25) for a, b in zip(found.origin, PLACE["origin"], strict=True)]
+        assert start == [3, 5, 2]
+        box = tuple(slice(a, a + size) for a, size in zip(start, found.values.shape[:3], strict=True))
+        assert np.abs(found.values - expected[box]).max() < 2e-3  # half floats
+        assert np.count_nonzero(found.values) == np.count_nonzero(expected)
+
+
+def test_an_empty_grid_is_read_as_one_empty_voxel(tmp_path: Path) -> None:
+    vdb.write_vdb(tmp_path / "a.vdb", {"density": np.zeros((4, 4, 4), np.float32)}, **PLACE)
+    found = vdb.read_vdb(tmp_path / "a.vdb", "density")
+    assert found.values.shape == (1, 1, 1) and found.values.max() == 0
+
+
+def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
+    vdb.write_vdb(tmp_path / "a.vdb", sample_grids(), **PLACE)
+    (tmp_path / "broken.vdb").write_bytes((tmp_path / "a.vdb").read_bytes()[:300])
+    for path, name in ((tmp_path / "none.vdb", "density"), (tmp_path / "a.vdb", "heat"), (tmp_path / "broken.vdb", "density")):
+        with pytest.raises(BackendError) as caught:
+            vdb.read_vdb(path, name)
+        assert caught.value.code == "vdb_unreadable"
+
+
+def test_turned_voxels_are_refused(tmp_path: Path) -> None:
+    module = vdb.openvdb_module()
+    assert module is not None
+    grid = module.FloatGrid()
+    grid.copyFromArray(np.ones((2, 2, 2), np.float32))
+    grid.name = "density"
+    grid.transform = module.createLinearTransform([[0.1, 0, 0, 0], [0, 0.2, 0, 0], [0, 0, 0.1, 0], [0, 0, 0, 1]])
+    module.write(str(tmp_path / "a.vdb"), grids=[grid])
+    del grid
+    with pytest.raises(BackendError, match="no cubes"):
+        vdb.read_vdb(tmp_path / "a.vdb", "density")

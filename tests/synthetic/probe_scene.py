@@ -16,11 +16,11 @@ import bpy
 
 from backend.contract.cameras import read_cameras
 from synthetic.layers import Layer, Quality
-from synthetic.scene import meshes, shading
+from synthetic.scene import cycles, meshes, shading
 from synthetic.scene.camera import set_camera
 from synthetic.scene.cycles import render_image, set_quality
 from synthetic.scene.light import add_black_world
-from synthetic.scene.smoke import show_smoke
+from synthetic.scene.smoke import show_smoke, smoke_window
 
 
 def main(folder: Path, smoke: Path) -> None:
@@ -43,6 +43,9 @@ def main(folder: Path, smoke: Path) -> None:
     for index in range(len(cameras.camera_to_world)):
         set_camera(cameras, index)
         render_image(folder / f"smoke_{index}.png", Layer.SMOKE)
+        cycles.smoke_window = lambda camera: ((0.0, 0.0), (1.0, 1.0))
+        render_image(folder / f"whole_{index}.png", Layer.SMOKE)
+        cycles.smoke_window = smoke_window
 
 
 def sphere_rings(radius: float, count: int) -> list[tuple[float, float]]:

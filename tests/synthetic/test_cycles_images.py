@@ -101,3 +101,15 @@ def test_smoke_lies_where_its_grid_says_and_is_as_opaque(probe: Path) -> None:
         assert opacity[row, column] == pytest.approx(expected, abs=0.02)
         assert opacity[0, 0] == 0
         assert image[..., :3].max() == 0  # no light, no bounces: black smoke
+
+
+def test_smoke_is_whole_although_only_its_window_is_rendered(probe: Path) -> None:
+    for index in range(2):
+        image, whole = (read_linear(probe / f"{name}_{index}.png")[..., 3] for name in ("smoke", "whole"))
+        rendered = np.argwhere(image > 0)
+        window = tuple(slice(low, high + 1) for low, high in zip(rendered.min(0), rendered.max(0), strict=True))
+        assert image[window].size < 0.5 * image.size
+        outside = whole.copy()
+        outside[window] = 0
+        assert outside.max() < 2e-3
+        assert np.abs(image - whole).max() < 0.02

@@ -1,0 +1,1 @@
+"""Scores against truth. Nothing here is read by a fit."""

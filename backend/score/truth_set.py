@@ -1,0 +1,122 @@
+"""A benchmark scene with its truth, as `synth ship` packs it: smoke of every view, cameras, volumes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+
+from backend.contract.cameras import Cameras, read_cameras
+from backend.contract.errors import BackendError
+from backend.geometry.camera import View, view_at
+from backend.io.images import decode_srgb
+
+INPUT_VIEW = "input"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Volume:
+    """A moment of the true smoke. density [X, Y, Z] 1/m; velocity [X, Y, Z, 3] m/s or None; voxel (i, j, k) has its centre
+    at origin + voxel_size (i, j, k), m."""
+
+    density: np.ndarray
+    velocity: np.ndarray | None
+    voxel_size: float
+    origin: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthSet:
+    """A packed scene. frames: of each view, the video frames that there are pictures of."""
+
+    folder: Path
+    name: str
+    num_frames: int
+    num_seen: int
+    fps: float
+    frames: dict[str, list[int]]
+    cameras: dict[str, Cameras]
+
+    def view(self, name: str, frame: int) -> View:
+        return view_at(self.cameras[name], 0 if self.cameras[name].is_still else frame)
+
+    def pictures(self, name: str) -> np.ndarray:
+        """[F, H, W, 4] float32 smoke on black: linear light premultiplied, and opacity; F as in frames[name]."""
+        if name == INPUT_VIEW:
+            parts = [self.folder / "input" / "smoke.mkv", self.folder / "truth" / "future.mkv"]
+            found = np.concatenate([_read_smoke(path) for path in parts if path.exists()])
+        else:
+            found = _read_smoke(self.folder / "truth" / name / "smoke.mkv")
+        if len(found) != len(self.frames[name]):
+            raise BackendError(
+                "truth_broken",
+                f"{self.folder} holds {len(found)} pictures of the view {name}, not {len(self.frames[name])}.",
+                hint="Make the set again with `synth ship`.",
+            )
+        return found
+
+    def volume_frames(self, *, with_velocity: bool = False) -> list[int]:
+        """The video frames that there is a volume of."""
+        with h5py.File(self.folder / "truth" / "volumes.h5") as file:
+            return [int(frame) for frame in file["velocity_frames" if with_velocity else "density_frames"][:]]  # type: ignore[index]
+
+    def volume(self, frame: int) -> Volume:
+        """The true smoke at a frame of volume_frames(). Raises KeyError where there is none."""
+        with h5py.File(self.folder / "truth" / "volumes.h5") as file:
+            density = _at(file, "density", frame)
+            if density is None:
+                raise KeyError(frame)
+            return Volume(
+                density=density,
+                velocity=_at(file, "velocity", frame),
+                voxel_size=float(file.attrs["voxel_size"]),  # type: ignore[arg-type]
+                origin=np.array(file.attrs["origin"], np.float64),
+            )
+
+
+def read_truth_set(folder: Path) -> TruthSet:
+    """Raises BackendError where the folder holds no packed scene."""
+    path = folder / "truth" / "truth.json"
+    try:
+        truth: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        frames = {name: [int(frame) for frame in found] for name, found in truth["views"].items()}
+        counts = int(truth["frames"]["count"]), int(truth["frames"]["seen"]), float(truth["frames"]["fps"])
+        name = str(truth["scene"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BackendError(
+            "truth_missing", f"{folder} holds no benchmark scene: {error}.", hint="Give a folder that `synth ship` made."
+        ) from error
+    places = {view: folder / ("input" if view == INPUT_VIEW else f"truth/{view}") / "cameras.json" for view in frames}
+    return TruthSet(
+        folder=folder,
+        name=name,
+        num_frames=counts[0],
+        num_seen=counts[1],
+        fps=counts[2],
+        frames=frames,
+        cameras={view: read_cameras(place) for view, place in places.items()},
+    )
+
+
+def _read_smoke(path: Path) -> np.ndarray:
+    """[F, H, W, 4] float32 of a video of straight alpha."""
+    try:
+        with av.open(str(path)) as container:
+            coded = np.stack([frame.to_ndarray(format="bgra") for frame in container.decode(video=0)])
+    except (OSError, ValueError) as error:
+        raise BackendError(
+            "truth_broken", f"{path} cannot be read: {error}.", hint="Make the set again with `synth ship`."
+        ) from error
+    found = np.stack([decode_srgb(np.ascontiguousarray(picture[..., [2, 1, 0, 3]])) for picture in coded])
+    found[..., :3] *= found[..., 3:]
+    return found
+
+
+def _at(file: h5py.File, name: str, frame: int) -> np.ndarray | None:
+    places = np.flatnonzero(file[f"{name}_frames"][:] == frame)  # type: ignore[index]
+    return np.asarray(file[name][int(places[0])], np.float32) if len(places) else None  # type: ignore[index]
