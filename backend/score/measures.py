@@ -18,7 +18,9 @@ def coded(picture: np.ndarray) -> np.ndarray:
 
 
 def decibels(squared_error: float) -> float:
-    """PSNR of a mean squared error, peak 1, at most LARGEST_DB."""
+    """PSNR of a mean squared error, peak 1, at most LARGEST_DB; NaN of NaN."""
+    if np.isnan(squared_error):
+        return float("nan")
     return float(min(LARGEST_DB, -10.0 * np.log10(max(squared_error, 1e-12))))
 
 

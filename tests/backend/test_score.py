@@ -1,0 +1,166 @@
+"""Scores and trivial answers: hand values, and what must hold whatever the picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backend.contract.errors import BackendError
+from backend.geometry.camera import View
+from backend.score import baselines, measures
+from backend.score.truth_set import read_truth_set
+
+SHIPPED = Path(__file__).resolve().parents[2] / "synthetic" / "bench"
+SCENES = sorted(path.name for path in SHIPPED.glob("*"))
+
+
+def camera(azimuth: float) -> View:
+    """At 10 m from the origin, level, looking at it."""
+    c, s = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+    matrix = np.eye(4)
+    forward, down = np.array([-c, -s, 0.0]), np.array([0.0, 0.0, -1.0])
+    matrix[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
+    matrix[:3, 3] = 10.0 * np.array([c, s, 0.0])
+    return View(width=60, height=40, fx=50.0, fy=50.0, cx=30.0, cy=20.0, camera_to_world=matrix)
+
+
+def blob(column: float, row: float, *, width: float = 3.0) -> np.ndarray:
+    y, x = np.mgrid[0:40, 0:60] + 0.5
+    weight = np.exp(-0.5 * ((x - column) ** 2 + (y - row) ** 2) / width**2)
+    return np.repeat(weight[..., None], 4, axis=2).astype(np.float32)
+
+
+def test_decibels_by_hand() -> None:
+    assert measures.decibels(0.01) == pytest.approx(20.0)
+    assert measures.decibels(0.0) == measures.LARGEST_DB
+    assert np.isnan(measures.decibels(float("nan")))
+
+
+def test_errors_are_of_coded_light_on_black() -> None:
+    truth = np.zeros((40, 60, 4), np.float32)
+    truth[10, 10] = (0.2140411, 0.2140411, 0.2140411, 0.5)  # codes to 0.5
+    full, smoke = measures.squared_errors(np.zeros_like(truth), truth)
+    assert full == pytest.approx(0.25 / truth[..., 0].size, rel=1e-5)
+    assert smoke == pytest.approx(0.25 / measures.smoke_mask(truth).sum(), rel=1e-5)
+    assert 40 < measures.smoke_mask(truth).sum() < 81  # a disc of 4 px
+
+
+def test_without_smoke_there_is_no_smoke_figure() -> None:
+    full, smoke = measures.squared_errors(np.zeros((8, 8, 4)), np.zeros((8, 8, 4)))
+    assert full == 0.0 and np.isnan(smoke)
+
+
+def test_correlation_by_hand() -> None:
+    values = np.array([1.0, 2.0, 3.0])
+    assert measures.correlation(values, 5 * values + 2) == pytest.approx(1.0)
+    assert measures.correlation(values, -values) == pytest.approx(-1.0)
+    assert np.isnan(measures.correlation(values, np.ones(3)))
+
+
+def test_relative_error_by_hand() -> None:
+    truth = np.zeros((2, 2, 2))
+    truth[0, 0, 0] = 4.0
+    assert measures.relative_l2(np.zeros_like(truth), truth) == pytest.approx(1.0)
+    assert measures.relative_l2(0.5 * truth, truth) == pytest.approx(0.5)
+
+
+def test_velocity_is_scored_inside_the_smoke_and_along_the_axes() -> None:
+    random = np.random.default_rng(0)
+    truth = random.normal(size=(6, 5, 4, 3))
+    density = np.zeros((6, 5, 4))
+    density[1:5, 1:4, 1:3] = 1.0
+    ours = np.where(density[..., None] > 0, truth, 1e6)
+    axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    found = measures.velocity_scores(ours, truth, density, axes)
+    assert found["correlation_up"] == pytest.approx(1.0) and found["end_point_error"] == 0.0
+    turned = measures.velocity_scores(np.stack([truth[..., 0], 0 * truth[..., 1], truth[..., 2]], -1), truth, density, np.eye(3))
+    assert turned["correlation_sideways"] == pytest.approx(1.0) and np.isnan(turned["correlation_up"])
+    assert turned["end_point_error"] == pytest.approx(np.sqrt(np.mean(truth[1:5, 1:4, 1:3, 1] ** 2)))
+
+
+@pytest.mark.parametrize("name", baselines.TRIVIAL)
+def test_trivial_answers_have_the_shape(name: str) -> None:
+    picture = blob(20.0, 15.0)
+    found = baselines.trivial_view(name, picture, camera(-90.0), camera(-60.0), np.zeros(3))
+    assert found.shape == picture.shape and np.isfinite(found).all()
+
+
+def test_mirror_and_copy() -> None:
+    picture = blob(20.0, 15.0)
+    views = camera(-90.0), camera(30.0)
+    assert np.array_equal(baselines.trivial_view("copy", picture, *views, np.zeros(3)), picture)
+    assert np.allclose(baselines.trivial_view("mirror", picture, *views, np.zeros(3)), blob(40.0, 15.0), atol=1e-6)
+
+
+def test_a_billboard_is_a_plane_in_space() -> None:
+    seen, wanted = camera(-90.0), camera(-50.0)
+    same = baselines.trivial_view("billboard", blob(22.0, 15.0), seen, seen, np.zeros(3))
+    assert np.abs(same - blob(22.0, 15.0)).max() < 1e-3
+    # What is drawn at a pixel of the picture lies where its ray meets the plane through the anchor.
+    anchor = np.array([0.5, -1.0, 0.3])
+    depth = seen.to_camera(anchor[None])[0, 2]
+    target, _ = wanted.project(seen.unproject(np.array([[22.0, 15.0]]), np.array([depth])))
+    picture = blob(22.0, 15.0, width=1.2)  # narrow: perspective moves the middle of what is wide
+    moved = baselines.trivial_view("billboard", picture, seen, wanted, anchor)[..., 3].astype(np.float64)
+    rows, columns = np.indices(moved.shape) + 0.5
+    middle = np.array([(moved * columns).sum(), (moved * rows).sum()]) / moved.sum()
+    assert np.linalg.norm(middle - target[0]) < 0.1
+
+
+def test_a_billboard_behind_the_camera_is_nothing() -> None:
+    found = baselines.trivial_view("billboard", blob(22.0, 15.0), camera(-90.0), camera(90.0), np.array([0.0, 30.0, 0.0]))
+    assert not found.any()
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"views": 3}', "[1]"])
+def test_a_folder_without_truth_is_said(tmp_path: Path, text: str) -> None:
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "truth.json").write_text(text)
+    with pytest.raises(BackendError, match="no benchmark scene"):
+        read_truth_set(tmp_path)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_set_in_the_tree_is_read(name: str) -> None:
+    scene = read_truth_set(SHIPPED / name)
+    assert scene.name == name and scene.num_frames == 135 and scene.num_seen == 120
+    pictures = scene.pictures("side")
+    assert pictures.shape == (len(scene.frames["side"]), 320, 180, 4)
+    assert pictures.min() >= 0.0 and pictures.max() <= 1.0 and pictures[-1, ..., 3].max() > 0.1
+    assert scene.volume_frames(with_velocity=True)[1] == 15
+    volume = scene.volume(15)
+    assert volume.velocity is not None and volume.velocity.shape == (*volume.density.shape, 3)
+    with pytest.raises(KeyError):
+        scene.volume(7)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_true_volumes_stand_where_the_pictures_show_them(name: str) -> None:
+    """The middle of the true optical depth, projected, is the middle of that in every rendered view."""
+    scene = read_truth_set(SHIPPED / name)
+    frame = 90
+    volume = scene.volume(frame)
+    cells = np.argwhere(volume.density > 0.02)
+    masses = volume.density[tuple(cells.T)]
+    points = volume.origin + volume.voxel_size * cells
+    for view in ("input", "nvs", "side", "back"):
+        place = scene.view(view, frame)
+        pixels, depth = place.project(points)
+        inside = (pixels > 0).all(1) & (pixels[:, 0] < place.width) & (pixels[:, 1] < place.height)
+        weights = masses[inside] / depth[inside] ** 2
+        expected = (weights[:, None] * pixels[inside]).sum(0) / weights.sum()
+        opacity = scene.pictures(view)[scene.frames[view].index(frame), ..., 3].astype(np.float64)
+        tau = -np.log1p(-np.clip(opacity, 0, 0.999))
+        rows, columns = np.indices(tau.shape) + 0.5
+        middle = np.array([(tau * columns).sum(), (tau * rows).sum()]) / tau.sum()
+        assert np.abs(middle - expected).max() < 12.0, (view, middle, expected)
+
+
+def test_truth_keeps_its_settings() -> None:
+    for name in SCENES:
+        truth = json.loads((SHIPPED / name / "truth" / "truth.json").read_text())
+        assert truth["simulation"]["scene"]["name"] == name
+        assert truth["render"]["quality"]["samples"] == 16
