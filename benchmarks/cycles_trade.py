@@ -61,16 +61,16 @@ def cases(*, has_unbiased: bool) -> list[Case]:
     found = [
         Case(axis="samples", layer=layer, quality=Quality(samples=samples, is_denoised=denoised, is_biased=biased))
         for layer in ("clip", "smoke")
-        for samples in (_SAMPLES if layer == "clip" else _SAMPLES[:6])
         for denoised in (False, True)
         for biased in biases
+        for samples in _SAMPLES[: 8 if layer == "clip" and biased else 6]
     ]
     base = Quality(samples=64)
+    for bounces in (0, 1, 2, 4, 8, 16):
+        found.append(Case(axis="bounces", layer="clip", quality=replace(base, bounces=bounces, volume_bounces=bounces)))
+    for rate in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0):
+        found.append(Case(axis="step rate", layer="clip", quality=replace(base, step_rate=rate)))
     for layer in ("clip", "smoke"):
-        for bounces in (0, 1, 2, 4, 8, 16):
-            found.append(Case(axis="bounces", layer=layer, quality=replace(base, bounces=bounces, volume_bounces=bounces)))
-        for rate in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0):
-            found.append(Case(axis="step rate", layer=layer, quality=replace(base, step_rate=rate)))
         for scale in (0.25, 0.5, 0.75, 1.0, 1.5, 2.0):
             found.append(Case(axis="resolution", layer=layer, quality=replace(base, samples=16), scale=scale))
     found += [Case(axis="samples", layer="opacity", quality=Quality(samples=samples)) for samples in (1, 2, 4, 8, 16, 32, 64)]

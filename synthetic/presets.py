@@ -55,7 +55,7 @@ PRESETS = {
         steps_per_frame=3,
         volumes_every=5,
         orbit=_SWEEP,
-        quality=Quality(samples=16, opacity_samples=8),
+        quality=Quality(samples=8, opacity_samples=8),
     ),
     # A look at a scene before it is made: bench with coarse smoke and few samples.
     "draft": Preset(

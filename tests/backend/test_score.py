@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import pytest
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.score import baselines, measures
-from backend.score.truth_set import read_truth_set
+from backend.score.evaluate import best_trivial, camera_axes, evaluate, table
+from backend.score.truth_set import Volume, read_truth_set
 
 SHIPPED = Path(__file__).resolve().parents[2] / "synthetic" / "bench"
 SCENES = sorted(path.name for path in SHIPPED.glob("*"))
@@ -164,3 +166,88 @@ def test_truth_keeps_its_settings() -> None:
         truth = json.loads((SHIPPED / name / "truth" / "truth.json").read_text())
         assert truth["simulation"]["scene"]["name"] == name
         assert truth["render"]["quality"]["samples"] == 16
+
+
+class Perfect:
+    """Answers with the truth, whatever it is asked, and knows no more than its pictures."""
+
+    def __init__(self, scene: TinyTruth, *, brightness: float = 1.0) -> None:
+        self.scene = scene
+        self.num_frames = scene.num_frames
+        self.brightness = brightness
+
+    def picture(self, view: View, frame: int) -> np.ndarray:
+        return self.scene.draw(view, frame) * np.float32(self.brightness)
+
+    def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        assert like.velocity is None or like.velocity.shape[:3] == like.density.shape
+        real = self.scene.volume(frame)
+        velocity = np.zeros((*real.density.shape, 3)) if real.velocity is None else real.velocity
+        return self.brightness * real.density, velocity
+
+
+class TinyTruth:
+    """A ball that rises and drifts, in four views; six frames seen, two to come."""
+
+    name, num_frames, num_seen, fps = "ball", 8, 6, 2.0
+    frames: ClassVar = {"input": list(range(8)), "nvs": [0, 2, 4, 6], "side": [0, 5], "back": [0, 5]}
+    azimuths: ClassVar = {"nvs": -90.0, "side": 30.0, "back": 90.0}
+
+    def view(self, name: str, frame: int) -> View:
+        return camera(-90.0 + 7.0 * frame if name == "input" else self.azimuths[name])
+
+    def draw(self, view: View, frame: int) -> np.ndarray:
+        pixel, _ = view.project(np.array([[0.3 * frame - 0.5, 0.4, 0.35 * frame - 1.0]]))
+        return blob(pixel[0, 0], pixel[0, 1])
+
+    def pictures(self, name: str) -> np.ndarray:
+        return np.stack([self.draw(self.view(name, frame), frame) for frame in self.frames[name]])
+
+    def volume_frames(self, *, with_velocity: bool = False) -> list[int]:
+        return [0, 3] if with_velocity else [0, 3, 6]
+
+    def volume(self, frame: int) -> Volume:
+        random = np.random.default_rng(frame)
+        velocity = random.normal(size=(4, 4, 4, 3)) if frame in (0, 3) else None
+        return Volume(density=random.uniform(size=(4, 4, 4)), velocity=velocity, voxel_size=0.5, origin=np.zeros(3))
+
+
+def test_the_truth_itself_gets_full_marks() -> None:
+    scene = TinyTruth()
+    scores = evaluate(Perfect(scene), scene, anchor=np.zeros(3))  # type: ignore[arg-type]
+    for view in ("input", "nvs", "side", "back", "future_input", "future_nvs"):
+        assert scores[view]["ours"]["full_db"] == measures.LARGEST_DB, view
+        for name, found in scores[view].items():
+            assert name == "ours" or found["full_db"] < measures.LARGEST_DB, (view, name)
+    volume = scores["volume"]
+    assert volume["correlation"] == pytest.approx(1.0) and volume["mass_ratio"] == pytest.approx(1.0)
+    assert volume["relative_l2"] == pytest.approx(0.0) and volume["velocity"]["correlation_depth"] == pytest.approx(1.0)
+    assert "ours" in table(scores) and "billboard" in table(scores)
+    json.dumps(scores, allow_nan=False)
+
+
+def test_what_is_wrong_scores_lower() -> None:
+    scene = TinyTruth()
+    scores = evaluate(Perfect(scene, brightness=0.7), scene, anchor=np.zeros(3))  # type: ignore[arg-type]
+    assert scores["input"]["ours"]["full_db"] < 40.0
+    assert scores["volume"]["mass_ratio"] == pytest.approx(0.7)
+    assert scores["volume"]["relative_l2"] == pytest.approx(0.3)
+    name, value = best_trivial(scores["nvs"], "full_db")
+    assert name in {*baselines.TRIVIAL, "still mean"} and value == max(
+        found["full_db"] for answer, found in scores["nvs"].items() if answer != "ours"
+    )
+
+
+def test_thirds_follow_the_seen_frames() -> None:
+    scene = TinyTruth()
+    copy = evaluate(Perfect(scene), scene, anchor=np.zeros(3))["nvs"]["copy"]  # type: ignore[arg-type]
+    by_frame = copy["by_frame_db"]
+    assert list(by_frame) == ["0", "2", "4"]  # frame 6 is the future
+    assert copy["first_db"] == by_frame["0"] == measures.LARGEST_DB
+    assert copy["middle_db"] == by_frame["2"] and copy["last_db"] == by_frame["4"]
+    assert by_frame["4"] < by_frame["2"] < by_frame["0"]
+
+
+def test_axes_of_a_view_are_level() -> None:
+    axes = camera_axes(camera(-90.0))
+    assert np.allclose(axes, [[1, 0, 0], [0, 0, 1], [0, 1, 0]], atol=1e-12)
