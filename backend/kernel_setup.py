@@ -1,6 +1,6 @@
 """What must be settled before numba loads: how waiting threads behave, and where machine code is kept.
 
-Imported first by the packages that hold kernels (backend.render, backend.physics). A user's own settings stand.
+Imported first by the packages that hold kernels (backend.render, backend.physics, backend.field). A user's own settings stand.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-KERNEL_FOLDERS = ("render", "physics")
+KERNEL_FOLDERS = ("render", "physics", "field")
 KEPT_SECONDS = 30 * 24 * 3600.0  # machine code of other versions that was not used for so long is removed
 
 

@@ -15,12 +15,12 @@ the particles: no atomics, equal bytes for any number of threads.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame
 
 CUTOFF = 3.0  # standard deviations; what lies beyond (0.8 % of a Gaussian) is shared out within
@@ -30,15 +30,6 @@ _INTERPOLATION_VARIANCE = 1.0 / 6.0  # voxels^2, of the triangle of width 2 that
 _SLAB = 4  # voxels along x filled by one thread at a time
 _WIDE_AXIS = 64.0  # voxels; a sum over the lattice equals the integral to 1e-4 from here on: one voxel at the cutoff
 _WIDE = 8.0  # voxels, the same for an ellipsoid, whose surface averages over many voxels
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lattice:
-    """Where the voxels are: centre of (i, j, k) at origin + voxel_size (i, j, k)."""
-
-    origin: tuple[float, float, float]  # m
-    voxel_size: float  # m
-    shape: tuple[int, int, int]
 
 
 def splat_extents(frame: ParticleFrame, voxel_size: float) -> np.ndarray:  # [N, 3] m

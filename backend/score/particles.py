@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from backend.geometry.camera import View
+from backend.geometry.lattice import Lattice
 from backend.io.particles import Particles
 from backend.render.picture import picture
-from backend.render.voxelize import Lattice, voxelize
+from backend.render.voxelize import voxelize
 from backend.score.truth_set import Volume
 
 

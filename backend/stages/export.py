@@ -16,9 +16,10 @@ import numpy as np
 from backend.contract.errors import BackendError
 from backend.contract.job import ExportConfig
 from backend.contract.result import VDB_NAME
+from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame, Particles
 from backend.io.vdb import write_vdb
-from backend.render.voxelize import CUTOFF, Lattice, splat_extents, voxelize
+from backend.render.voxelize import CUTOFF, splat_extents, voxelize
 from backend.reporting import Report
 
 Vector = tuple[float, float, float]

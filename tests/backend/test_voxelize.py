@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
+from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame
-from backend.render.voxelize import CUTOFF, MIN_SCALE_VOXELS, Lattice, rotation_matrices, splat_extents, voxelize
+from backend.render.voxelize import CUTOFF, MIN_SCALE_VOXELS, rotation_matrices, splat_extents, voxelize
 
 
 def particles(
