@@ -71,10 +71,11 @@ def smoke_window(camera: bpy.types.Object) -> tuple[tuple[float, float], tuple[f
 def _corners(item: bpy.types.Object) -> list[Vector]:
     """Corners of the box around the density, object coordinates, m; empty where there is none. An object's own box is
     that of all grids, and velocity fills the whole air."""
-    try:
+    if hasattr(bpy.utils, "expose_bundled_modules"):  # a distribution's Blender has its modules on Python's path
         bpy.utils.expose_bundled_modules()
+    try:
         import openvdb
-    except ImportError:  # a Blender whose OpenVDB module is not bundled: a larger window, the same image
+    except ImportError:  # a Blender without the module: a larger window, the same image
         return [Vector(corner) for corner in item.bound_box]
     grid = openvdb.read(item.data.filepath, "density")
     if grid.activeVoxelCount() == 0:
