@@ -4,7 +4,8 @@
     SCENE/truth/   future.mkv; nvs/ side/ back/ each with smoke.mkv and cameras.json;              it is scored on this
                    volumes.h5, truth.json
 
-smoke.mkv is FFV1 (RFC 9043), 8-bit RGBA, straight alpha, sRGB: any player and the backend read it as a clip with opacity.
+smoke.mkv is FFV1 (RFC 9043), 8-bit RGBA: smoke on black, sRGB-coded light premultiplied with opacity, and opacity. Players
+show it, and `reconstruct` takes it as a clip: it recognises that alpha is premultiplied.
 Runs in the backend's environment. `truth.json` is written last: where it is, the scene is whole.
 """
 
@@ -25,7 +26,6 @@ from backend.contract.errors import BackendError
 from backend.contract.result import VDB_NAME
 from backend.io.atomic import whole_file
 from backend.io.hdf5_file import whole_hdf5
-from backend.io.images import linear_to_srgb, srgb_to_linear
 from backend.io.vdb import DenseGrid, read_vdb
 from synthetic.clip import encode_clip
 from synthetic.layers import Layer
@@ -39,6 +39,8 @@ SMOKE_VIDEO = "smoke.mkv"
 FUTURE_VIDEO = "future.mkv"
 VOLUMES_FILE = "volumes.h5"
 DENSITY_EVERY, VELOCITY_EVERY = 5, 15  # frames
+_CLIP_QUALITY = 17  # as a camera would keep it; the lossless frames are too large to ship
+_STEPS = {"density": 2.0**-7, "velocity": 2.0**-5}  # 1/m, m/s: finer digits of turbulence would be half of the file
 _FAINT = 0.01  # 1/m: no smoke to see
 _COARSER = 2  # voxels of the simulation along an edge of one that is shipped
 _FORMAT_VERSION = 1
@@ -58,7 +60,7 @@ def pack(scene: str, folder: Path, preset: Preset, target: Path) -> Path:
     (target / TRUTH_FOLDER).mkdir(parents=True, exist_ok=True)
     (target / INPUT_FOLDER).mkdir(parents=True, exist_ok=True)
     clip = [folder / image.path for image in images if image.layer is Layer.CLIP]
-    encode_clip(clip, target / INPUT_FOLDER / "clip.mp4", fps=preset.fps)
+    encode_clip(clip, target / INPUT_FOLDER / "clip.mp4", fps=preset.fps, quality=_CLIP_QUALITY)
     frames: dict[str, list[int]] = {}
     for view, cameras in view_cameras(preset).items():
         smoke = [image for image in images if image.layer is Layer.SMOKE and image.view == view]
@@ -99,13 +101,11 @@ def encode_smoke(pictures: Iterator[np.ndarray], target: Path, *, fps: float) ->
         container.mux(stream.encode())
 
 
-def straight(picture: np.ndarray) -> np.ndarray:
-    """[H, W, 4] uint16 BGRA, coded light premultiplied with opacity -> uint8, straight alpha; colour 0 where opacity is."""
-    opacity = np.rint(picture[..., 3:] / 65535 * 255) / 255
-    light = srgb_to_linear((picture[..., :3] / 65535).astype(np.float32))
-    color = np.divide(light, opacity, out=np.zeros_like(light), where=opacity > 0)
-    coded = linear_to_srgb(np.clip(color, 0.0, 1.0).astype(np.float32))
-    return np.rint(np.concatenate([coded, opacity], axis=-1) * 255).astype(np.uint8)
+def in_8_bits(picture: np.ndarray) -> np.ndarray:
+    """[H, W, 4] uint16 -> uint8; light is coded and stays premultiplied. No light where opacity rounds to 0."""
+    found = np.rint(picture / 257).astype(np.uint8)
+    found[found[..., 3] == 0] = 0
+    return found
 
 
 def _pictures(folder: Path, images: Sequence[Image]) -> Iterator[np.ndarray]:
@@ -117,14 +117,14 @@ def _pictures(folder: Path, images: Sequence[Image]) -> Iterator[np.ndarray]:
                 f"{folder / image.path} is no 16-bit picture with opacity.",
                 hint="Remove it and render again.",
             )
-        yield straight(picture)
+        yield in_8_bits(picture)
 
 
 def pack_volumes(smoke: Path, target: Path, *, num_frames: int) -> dict[str, object]:
     """Density every 5th and velocity every 15th frame, means over 2 x 2 x 2 voxels, all on one box. Returns what is there.
 
     volumes.h5: attrs voxel_size m, origin m (centre of the first voxel); density [F, X, Y, Z] 1/m, density_frames [F];
-    velocity [G, X, Y, Z, 3] m/s, zero far from smoke, velocity_frames [G]; float16. A velocity grid fills the whole air.
+    velocity [G, X, Y, Z, 3] m/s, zero far from smoke, velocity_frames [G]; float16, in steps of 1/128 and 1/32.
     """
     air = read_vdb(smoke / VDB_NAME.format(1), "velocity")
     shape = tuple(size // _COARSER for size in air.values.shape[:3])
@@ -143,7 +143,7 @@ def pack_volumes(smoke: Path, target: Path, *, num_frames: int) -> dict[str, obj
     with whole_hdf5(target) as file:
         file.attrs["voxel_size"], file.attrs["origin"] = size, origin
         for name, stack in stacks.items():
-            array = np.stack(stack).astype(np.float16)
+            array = (np.rint(np.stack(stack) / _STEPS[name]) * _STEPS[name]).astype(np.float16)
             file.create_dataset(
                 name, data=array, chunks=(1, *array.shape[1:]), compression="gzip", compression_opts=9, shuffle=True
             )
@@ -205,7 +205,7 @@ def _write_truth(
         "units": {
             "density": "1/m extinction",
             "velocity": "m/s",
-            "smoke": "8-bit sRGB, straight alpha: the fourth channel is opacity",
+            "smoke": "8-bit: light premultiplied with opacity, sRGB-coded; 4th channel opacity, not coded",
             "cameras": "metres; axes x right, y down, z forward; world z up; pixel centres at +0.5",
         },
         "render": json.loads((folder / "render.json").read_text(encoding="utf-8")),

@@ -41,13 +41,13 @@ def row(scene: Path) -> np.ndarray:
     truth = json.loads((scene / "truth" / "truth.json").read_text(encoding="utf-8"))
     clip = frames(scene / "input" / "clip.mp4")
     last = len(clip) - 1
-    pictures = [clip[0], clip[last // 2], clip[last], on_black(frames(scene / "input" / "smoke.mkv")[last])]
+    pictures = [clip[0], clip[last // 2], clip[last], frames(scene / "input" / "smoke.mkv")[last]]
     for view in ("nvs", "side", "back"):
         shown = truth["views"][view]
         index = int(np.argmin(np.abs(np.array(shown) - last)))
-        pictures.append(on_black(frames(scene / "truth" / view / "smoke.mkv")[index]))
+        pictures.append(frames(scene / "truth" / view / "smoke.mkv")[index])
     gap = np.zeros((pictures[0].shape[0], _GAP, 3), np.uint8)
-    line = np.concatenate([part for picture in pictures for part in (picture, gap)], axis=1)
+    line = np.concatenate([part for picture in pictures for part in (picture[..., :3], gap)], axis=1)
     title = np.full((20, line.shape[1], 3), 30, np.uint8)
     text = f"{scene.name}: clip at frames 0, {last // 2}, {last}; smoke alone at {last}: input, first place, side, back"
     cv2.putText(title, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
@@ -55,16 +55,10 @@ def row(scene: Path) -> np.ndarray:
 
 
 def frames(path: Path) -> list[np.ndarray]:
-    """All pictures of a video, BGR or BGRA uint8."""
+    """All pictures of a video, uint8: BGR, or BGR on black and opacity."""
     with av.open(str(path)) as container:
         is_clear = container.streams.video[0].codec_context.pix_fmt == "bgra"
         return [frame.to_ndarray(format="bgra" if is_clear else "bgr24") for frame in container.decode(video=0)]
-
-
-def on_black(picture: np.ndarray) -> np.ndarray:
-    """Straight alpha over black, mixed as light."""
-    opacity = picture[..., 3:] / 255
-    return np.rint(picture[..., :3] * opacity ** (1 / 2.2)).astype(np.uint8)
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def read_truth_set(folder: Path) -> TruthSet:
 
 
 def _read_smoke(path: Path) -> np.ndarray:
-    """[F, H, W, 4] float32 of a video of straight alpha."""
+    """[F, H, W, 4] float32 linear of a video of coded, premultiplied light and opacity."""
     try:
         with av.open(str(path)) as container:
             coded = np.stack([frame.to_ndarray(format="bgra") for frame in container.decode(video=0)])
@@ -112,9 +112,7 @@ def _read_smoke(path: Path) -> np.ndarray:
         raise BackendError(
             "truth_broken", f"{path} cannot be read: {error}.", hint="Make the set again with `synth ship`."
         ) from error
-    found = np.stack([decode_srgb(np.ascontiguousarray(picture[..., [2, 1, 0, 3]])) for picture in coded])
-    found[..., :3] *= found[..., 3:]
-    return found
+    return np.stack([decode_srgb(np.ascontiguousarray(picture[..., [2, 1, 0, 3]])) for picture in coded])
 
 
 def _at(file: h5py.File, name: str, frame: int) -> np.ndarray | None:

@@ -165,7 +165,7 @@ def test_truth_keeps_its_settings() -> None:
     for name in SCENES:
         truth = json.loads((SHIPPED / name / "truth" / "truth.json").read_text())
         assert truth["simulation"]["scene"]["name"] == name
-        assert truth["render"]["quality"]["samples"] == 16
+        assert truth["render"]["preset"] == "bench"
 
 
 class Perfect:
