@@ -104,8 +104,8 @@ def _solve_poisson(source: np.ndarray, lattice: Lattice, *, has_floor: bool) -> 
     spectrum /= -(waves[0][:, None, None] + waves[1][None, :, None] + waves[2]).astype(np.float32)
     if has_floor:
         spectrum = scipy.fft.dct(spectrum, type=4, axis=2, norm="ortho")  # its own inverse
-        return scipy.fft.idstn(spectrum, type=2, axes=(0, 1), norm="ortho").astype(np.float32)
-    return scipy.fft.idstn(spectrum, type=2, norm="ortho").astype(np.float32)
+        return np.asarray(scipy.fft.idstn(spectrum, type=2, axes=(0, 1), norm="ortho"), np.float32)
+    return np.asarray(scipy.fft.idstn(spectrum, type=2, norm="ortho"), np.float32)
 
 
 def transported(amounts: np.ndarray, air: Air, lattice: Lattice, *, seconds: float) -> np.ndarray:
