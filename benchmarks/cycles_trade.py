@@ -29,6 +29,7 @@ from synthetic.render import RenderOrder, build_scene
 from synthetic.scene.camera import set_camera
 from synthetic.scene.cycles import render_pixels, set_quality
 from synthetic.scene.smoke import show_smoke
+from synthetic.scenes import SCENES
 from synthetic.sweep import orbit_cameras
 
 REFERENCE_SAMPLES = 2048
@@ -89,7 +90,7 @@ def main(arguments: list[str]) -> int:
     order = RenderOrder(scene=given.scene, folder=given.out, preset=preset, preset_name="bench")
     given.out.mkdir(parents=True, exist_ok=True)
     build_scene(order)
-    show_smoke(given.smoke.absolute())
+    show_smoke(given.smoke.absolute(), albedo=SCENES[given.scene].albedo)
     references = _references(preset, given.frame, given.out)
     version = ".".join(map(str, bpy.app.version[:2]))
     for case in cases(has_unbiased=bpy.app.version >= (5, 0)):

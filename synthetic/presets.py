@@ -28,7 +28,7 @@ class Preset:
     views: tuple[str, ...] = ("input", "nvs", "side", "back")
 
 
-_SWEEP = Orbit()
+_SWEEP = Orbit()  # shows all of the solver's box
 
 PRESETS = {
     # Supplement 7.1: 1080x1920, T' = 270 of which 240 are seen, at most 200 samples.
@@ -38,8 +38,8 @@ PRESETS = {
         num_frames=270,
         num_future=30,
         fps=30.0,
-        voxel_size=0.05,
-        steps_per_frame=3,
+        voxel_size=1 / 15,
+        steps_per_frame=2,
         volumes_every=10,
         orbit=_SWEEP,
         quality=Quality(samples=200),
@@ -51,8 +51,8 @@ PRESETS = {
         num_frames=135,
         num_future=15,
         fps=15.0,
-        voxel_size=0.125,
-        steps_per_frame=3,
+        voxel_size=1 / 6,
+        steps_per_frame=2,
         volumes_every=5,
         orbit=_SWEEP,
         quality=Quality(samples=8, opacity_samples=8),
@@ -64,7 +64,7 @@ PRESETS = {
         num_frames=135,
         num_future=15,
         fps=15.0,
-        voxel_size=0.25,
+        voxel_size=1 / 3,
         steps_per_frame=2,
         volumes_every=15,
         orbit=_SWEEP,
@@ -78,7 +78,7 @@ PRESETS = {
         num_frames=9,
         num_future=1,
         fps=4.0,
-        voxel_size=0.4,
+        voxel_size=0.5,
         steps_per_frame=6,
         volumes_every=4,
         orbit=_SWEEP,

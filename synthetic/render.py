@@ -126,7 +126,7 @@ def _render_one(order: RenderOrder, image: Image, smoke: _SmokeFiles) -> float |
             left_behind.unlink()
         begin = time.monotonic()
         has_smoke = image.layer in (Layer.CLIP, Layer.SMOKE)
-        show_smoke(smoke.path(image.frame) if has_smoke else None)
+        show_smoke(smoke.path(image.frame) if has_smoke else None, albedo=SCENES[order.scene].albedo)
         set_camera(view_cameras(order.preset)[image.view], image.frame)
         render_image(target, image.layer)
         return time.monotonic() - begin
@@ -220,6 +220,7 @@ def describe(order: RenderOrder) -> dict[str, object]:
         "blender": bpy.app.version_string,
         "machine": platform.machine(),
         "seed": _seed(order),
+        "albedo": SCENES[order.scene].albedo,
         "quality": {name: getattr(quality, name) for name in quality.__slots__ if name != "threads"},
         "own_smoke": order.smoke_folder is not None,
         "own_scene": order.blend_file.name if order.blend_file else None,

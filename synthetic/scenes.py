@@ -45,30 +45,32 @@ class SmokeScene:
     size: width, depth, height of the box of air, m, its floor at z = 0 and its middle at (centre, z axis).
     wind: at 10 m height, m/s; less below (power law). confinement: strength of vorticity confinement, 1.
     cooling: time in which hot smoke loses its heat, s. warm_up: seconds simulated before the first frame.
+    albedo: share of light that smoke scatters on, linear RGB.
     """
 
     name: str
     purpose: str
     sources: tuple[Source, ...]
-    size: tuple[float, float, float] = (9.0, 9.0, 15.0)
+    size: tuple[float, float, float] = (12.0, 12.0, 20.0)
     centre: tuple[float, float] = (0.0, 0.0)
     wind: tuple[float, float] = (0.0, 0.0)
     confinement: float = 0.5
     cooling: float = 8.0
     warm_up: float = 0.0
     obstacles: tuple[Obstacle, ...] = ()
+    albedo: tuple[float, float, float] = (0.5, 0.49, 0.48)
     seed: int = 1
 
 
 CHIMNEY_TOP = 2.0  # m, height of the rendered chimneys that sources sit in
 
-_CHIMNEY = Source(position=(0.0, 0.0, CHIMNEY_TOP), radius=0.6, temperature=220.0, rise=2.0)
+_CHIMNEY = Source(position=(0.0, 0.0, CHIMNEY_TOP), radius=0.42, temperature=220.0, rise=2.0)
 
 _ALL = (
     SmokeScene(
         name="steady_plume",
         purpose="A thick plume that has stood for a while: the inside is hidden, nothing but texture shows motion.",
-        sources=(replace(_CHIMNEY, radius=0.75, density=5.0),),
+        sources=(replace(_CHIMNEY, radius=0.5, density=5.0),),
         wind=(0.5, 0.3),
         warm_up=5.0,
         seed=21,
@@ -83,9 +85,9 @@ _ALL = (
     SmokeScene(
         name="wind_wisp",
         purpose="A thin wisp that the wind bends: faint, mostly transparent, moving sideways faster than up.",
-        sources=(replace(_CHIMNEY, position=(-2.0, -1.2, CHIMNEY_TOP), radius=0.35, density=4.0, rise=1.5),),
-        size=(10.0, 9.0, 13.0),
-        centre=(0.8, 0.4),
+        sources=(replace(_CHIMNEY, position=(-2.0, -1.2, CHIMNEY_TOP), radius=0.28, density=4.0, rise=1.5),),
+        size=(14.0, 12.0, 20.0),
+        centre=(1.0, 0.4),
         wind=(0.95, 0.55),
         warm_up=4.0,
         seed=23,
@@ -94,8 +96,8 @@ _ALL = (
         name="merging_sources",
         purpose="Two sources at different depths whose plumes lean together and merge: which smoke is in front?",
         sources=(
-            replace(_CHIMNEY, position=(-0.95, -0.6, CHIMNEY_TOP), radius=0.5),
-            replace(_CHIMNEY, position=(0.95, 0.6, CHIMNEY_TOP), radius=0.5, temperature=160.0, start=1.0),
+            replace(_CHIMNEY, position=(-0.95, -0.6, CHIMNEY_TOP), radius=0.36),
+            replace(_CHIMNEY, position=(0.95, 0.6, CHIMNEY_TOP), radius=0.36, temperature=160.0, start=1.0),
         ),
         wind=(0.2, 0.4),
         warm_up=1.5,
@@ -104,7 +106,7 @@ _ALL = (
     SmokeScene(
         name="obstacle_plume",
         purpose="A ground fire under a slab: smoke spreads below it, curls around its edges and joins above.",
-        sources=(Source(position=(0.0, 0.0, 0.6), radius=0.55, density=4.0, temperature=200.0, rise=1.0),),
+        sources=(Source(position=(0.0, 0.0, 0.6), radius=0.45, density=4.0, temperature=200.0, rise=1.0),),
         obstacles=(Obstacle(low=(-1.6, -1.2, 3.4), high=(0.8, 1.2, 4.0)),),
         wind=(0.3, 0.1),
         warm_up=2.0,
@@ -113,7 +115,8 @@ _ALL = (
     SmokeScene(
         name="demo",
         purpose="The bundled clip: a plume that starts in view of a camera on a tripod.",
-        sources=(_CHIMNEY,),
+        sources=(replace(_CHIMNEY, radius=0.6),),
+        albedo=(0.9, 0.885, 0.87),
         size=(9.0, 7.0, 13.0),
         centre=(1.2, 0.4),
         wind=(0.9, 0.3),

@@ -21,9 +21,9 @@ class Orbit:
     phi(t) = -105 + 60 t / T').
     """
 
-    target: Vector = (0.0, 0.0, 6.4)
-    distance: float = 26.0
-    half_height: float = 7.6
+    target: Vector = (0.0, 0.0, 8.2)
+    distance: float = 32.0
+    half_height: float = 10.8
     elevation: float = 10.0
     azimuth_start: float = -105.0
     azimuth_stop: float = -45.0

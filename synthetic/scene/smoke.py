@@ -11,19 +11,18 @@ from mathutils import Vector
 
 from synthetic.scene import shading
 
-_ALBEDO = (0.9, 0.885, 0.87)
 _ANISOTROPY = 0.25  # smoke throws more light forward than back
 _NAME = "smoke"
 _MARGIN = 4.0  # px around the smoke's box
 _CORNER = (0.0, 0.0), (0.1, 0.1)
 
 
-def show_smoke(path: Path | None) -> None:
-    """Show the grids of a VDB file; None: no smoke."""
+def show_smoke(path: Path | None, *, albedo: tuple[float, float, float] = (0.9, 0.885, 0.87)) -> None:
+    """Show the grids of a VDB file; None: no smoke. albedo, linear RGB, counts when the smoke is first shown."""
     item = bpy.data.objects.get(_NAME)
     if item is None:
         item = bpy.data.objects.new(_NAME, bpy.data.volumes.new(_NAME))
-        item.data.materials.append(shading.smoke(_NAME, _ALBEDO, anisotropy=_ANISOTROPY))
+        item.data.materials.append(shading.smoke(_NAME, albedo, anisotropy=_ANISOTROPY))
         bpy.context.scene.collection.objects.link(item)
     item.hide_render = path is None
     if path is not None:
