@@ -20,7 +20,7 @@ INPUT_FOLDER = "input"
 TRUTH_FOLDER = "truth"
 SMOKE_FOLDER = "smoke"
 INPUT_VIEW = "input"
-SHIPPED_EVERY = {"input": 1, "nvs": 6, "side": 18, "back": 18}  # frames
+SHIPPED_EVERY = {"input": 1, "nvs": 3, "side": 9, "back": 9}  # frames
 TEST_VIEWS = {"nvs": 0.0, "side": 120.0, "back": 180.0}  # degrees that the camera is turned from the first frame's
 
 

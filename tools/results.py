@@ -41,10 +41,15 @@ def page() -> str:
         *forecast(load("forecast_demo"), load("forecast_plume")),
         *rendering(load("render_speed")),
         *physics(load("physics_speed")),
-        *cycles_trade(load("cycles_trade")),
-        *blender_parity(load("blender_parity")),
+        *(cycles_trade(load("cycles_trade")) if has("cycles_trade") else []),
+        *(blender_parity(load("blender_parity")) if has("blender_parity") else []),
     ]
     return "\n".join(parts)
+
+
+def has(name: str) -> bool:
+    """Whether it was measured."""
+    return (FIGURES / f"{name}.json").is_file()
 
 
 def load(name: str) -> dict[str, Any]:

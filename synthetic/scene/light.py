@@ -7,10 +7,10 @@ import math
 import bpy
 
 SUN_AZIMUTH = 190.0  # degrees; from the left for the training sweep, then from behind: shaded sides, lit edges
-SUN_ELEVATION = 38.0  # degrees
-_SUN_STRENGTH = 4.6  # W/m^2
+SUN_ELEVATION = 30.0  # degrees: low enough to model the smoke and to throw its shadow into view
+_SUN_STRENGTH = 7.0  # W/m^2
 _SUN_SIZE = 1.0  # degrees
-_SKY_STRENGTH = 0.7
+_SKY_STRENGTH = 0.35
 _SKY_MAP = 128  # px high
 
 

@@ -66,9 +66,9 @@ def test_only_what_ships_is_planned() -> None:
     assert counts == {
         ("input", Layer.CLIP): 120,
         ("input", Layer.SMOKE): 135,
-        ("nvs", Layer.SMOKE): 23,
-        ("side", Layer.SMOKE): 8,
-        ("back", Layer.SMOKE): 8,
+        ("nvs", Layer.SMOKE): 45,
+        ("side", Layer.SMOKE): 15,
+        ("back", Layer.SMOKE): 15,
     }
 
 
@@ -96,7 +96,7 @@ def test_a_packed_scene_is_whole_and_leaks_nothing(scene: Path, tmp_path: Path) 
     assert readable == ["cameras.json", "clip.mp4", "smoke.mkv"]
     assert len(decode(tmp_path / "puff" / "input" / "smoke.mkv")) == truth["frames"]["seen"] == 8
     assert len(decode(tmp_path / "puff" / "truth" / "future.mkv")) == 1
-    assert truth["views"] == {"input": list(range(9)), "nvs": [0, 6], "side": [0], "back": [0]}
+    assert truth["views"] == {"input": list(range(9)), "nvs": [0, 3, 6], "side": [0], "back": [0]}
     for view in ("nvs", "side", "back"):
         assert len(decode(tmp_path / "puff" / "truth" / view / "smoke.mkv")) == len(truth["views"][view])
         assert read_cameras(tmp_path / "puff" / "truth" / view / "cameras.json").is_still
@@ -115,8 +115,8 @@ def check_sums(folder: Path, truth: dict) -> None:
 def test_packing_says_which_image_is_missing(scene: Path, tmp_path: Path) -> None:
     copy = tmp_path / "scene"
     shutil.copytree(scene, copy)
-    (copy / "truth" / "nvs" / "smoke" / "0006.png").unlink()
-    with pytest.raises(BackendError, match=r"1 images .* the first is truth/nvs/smoke/0006.png"):
+    (copy / "truth" / "nvs" / "smoke" / "0003.png").unlink()
+    with pytest.raises(BackendError, match=r"1 images .* the first is truth/nvs/smoke/0003.png"):
         pack("puff_front", copy, TINY, tmp_path / "puff")
     assert not (tmp_path / "puff").exists()
 
@@ -136,7 +136,7 @@ def test_volumes_keep_the_mass_and_the_place(scene: Path, tmp_path: Path) -> Non
         for values, start, step in ((coarse, origin, size), (fine.values, fine.origin, fine.voxel_size)):
             weights = values.sum(axis=tuple(other for other in range(3) if other != axis))
             middles.append(start[axis] + step * (weights * np.arange(len(weights))).sum() / weights.sum())
-        assert middles[0] == pytest.approx(middles[1], abs=0.02)
+        assert middles[0] == pytest.approx(middles[1], abs=0.05 * size)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in SHIPPED_FOLDER.glob("*")))
