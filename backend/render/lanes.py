@@ -219,22 +219,42 @@ _EXP2 = (0.00132647, 0.00967151, 0.05550734, 0.24022242, 0.69314698, 1.0)
 _ROUND = 12582912.0  # 1.5 * 2^23: adding it leaves the nearest integer in the low bits
 
 
+def _exponential(builder: Any, x: Any) -> Any:
+    lowest = _constant(LOWEST_EXPONENT)
+    x = builder.select(builder.fcmp_ordered(">", x, lowest), x, lowest)
+    rounded = _muladd(builder, x, _constant(1.4426950408889634), _constant(_ROUND))
+    whole = builder.fsub(rounded, _constant(_ROUND))
+    fraction = _muladd(builder, x, _constant(1.4426950408889634), builder.fneg(whole))
+    power = _constant(_EXP2[0])
+    for coefficient in _EXP2[1:]:
+        power = _muladd(builder, power, fraction, _constant(coefficient))
+    shift = builder.shl(builder.bitcast(rounded, _INTS), ir.Constant(_INTS, [ir.Constant(_INT, 23)] * LANES))
+    return builder.bitcast(builder.add(builder.bitcast(power, _INTS), shift), _VECTOR)
+
+
 @_operation
 def exponential(typingctx: Any, x: Any) -> Any:
     """exp(max(x, -30)) for x at most 0 (up to 80 in fact): 2^n times a polynomial in the fraction."""
     del typingctx, x
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        lowest = _constant(LOWEST_EXPONENT)
-        x = builder.select(builder.fcmp_ordered(">", args[0], lowest), args[0], lowest)
-        rounded = _muladd(builder, x, _constant(1.4426950408889634), _constant(_ROUND))
-        whole = builder.fsub(rounded, _constant(_ROUND))
-        fraction = _muladd(builder, x, _constant(1.4426950408889634), builder.fneg(whole))
-        power = _constant(_EXP2[0])
-        for coefficient in _EXP2[1:]:
-            power = _muladd(builder, power, fraction, _constant(coefficient))
-        shift = builder.shl(builder.bitcast(rounded, _INTS), ir.Constant(_INTS, [ir.Constant(_INT, 23)] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(power, _INTS), shift), _VECTOR)
+        return _exponential(builder, args[0])
+
+    return lanes_type(lanes_type), codegen
+
+
+@_operation
+def absorbed(typingctx: Any, x: Any) -> Any:
+    """1 - exp(-x) for x at least 0, with all its digits near 0: there by its series to x^7."""
+    del typingctx, x
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        x = args[0]
+        series = _constant(1.0 / 5040.0)
+        for coefficient in (-1.0 / 720.0, 1.0 / 120.0, -1.0 / 24.0, 1.0 / 6.0, -0.5, 1.0):
+            series = _muladd(builder, series, x, _constant(coefficient))
+        whole = builder.fsub(_constant(1.0), _exponential(builder, builder.fneg(x)))
+        return builder.select(builder.fcmp_ordered("<", x, _constant(0.5)), builder.fmul(series, x), whole)
 
     return lanes_type(lanes_type), codegen
 

@@ -71,7 +71,7 @@ class Gradients:
 
 def forward(gaussians: Gaussians, view: View, *, features: np.ndarray | None = None, near: float = projection.NEAR) -> Splat:
     """Draws the optical depth and `features` [N, K] (None: K = 0). near: depth in m before which nothing is seen."""
-    _check_view(view, near)
+    check_view(view, near)
     geometry = _geometry(gaussians, view, near)
     return _drawn(gaussians, view, geometry, gaussians.optical_masses, features)
 
@@ -86,7 +86,7 @@ def reweighted(splat: Splat, optical_masses: np.ndarray, features: np.ndarray | 
 
 def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
     """Gradients of a loss whose gradient with respect to splat.image is grad_image [1 + K, H, W]."""
-    _require_image("grad_image", grad_image, splat.image.shape)
+    require_image("grad_image", grad_image, splat.image.shape)
     geometry, bins, num = splat.geometry, splat.geometry.bins, len(splat.gaussians)
     num_features = splat.features.shape[1]
     gradient, scale = _gradient_levels("grad_image", grad_image, geometry.pyramid)
@@ -121,7 +121,7 @@ def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
 
 def adjoint_mass(splat: Splat, image_grad: np.ndarray) -> np.ndarray:
     """Transpose of masses -> tau: [N] sums over pixels of image_grad [H, W] times d tau / d optical_mass [1/m^2]."""
-    _require_image("image_grad", image_grad, splat.image.shape[1:])
+    require_image("image_grad", image_grad, splat.image.shape[1:])
     geometry, bins = splat.geometry, splat.geometry.bins
     gradient, scale = _gradient_levels("image_grad", image_grad[None], geometry.pyramid)
     slots = np.empty((len(bins.pair_slots), 1), np.float32)
@@ -131,14 +131,14 @@ def adjoint_mass(splat: Splat, image_grad: np.ndarray) -> np.ndarray:
     return sums[:, 0] * geometry.splats[:, 5] * geometry.splats[:, 6] * scale
 
 
-def _check_view(view: View, near: float) -> None:
+def check_view(view: View, near: float) -> None:
     require_finite("camera_to_world", np.asarray(view.camera_to_world), (4, 4))
     numbers = np.array([view.width, view.height, view.fx, view.fy, view.cx, view.cy, near], np.float64)
     if not np.isfinite(numbers).all() or numbers[:4].min() <= 0 or near <= 0:
         raise ValueError(f"{view.width} x {view.height} px, fx {view.fx}, fy {view.fy}, near {near} m is no camera")
 
 
-def _require_image(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+def require_image(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind != "f":
         raise ValueError(f"{name} is {getattr(array, 'dtype', type(array))} {getattr(array, 'shape', '')}, not float {shape}")
 

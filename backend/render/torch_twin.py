@@ -44,6 +44,32 @@ def render(
     return image
 
 
+def render_layers(
+    positions: Tensor,  # [N, 3] m
+    scales: Tensor,  # [N, 3] m
+    rotations: Tensor,  # [N, 4] quaternions w x y z
+    optical_masses: Tensor,  # [N] m^2
+    features: Tensor,  # [N, K]
+    view: View,
+    *,
+    near: float = NEAR,
+) -> tuple[Tensor, Tensor]:
+    """The coloured mode (layers.py): premultiplied features [K, H, W] and opacity [H, W], composited front to back."""
+    rotation = torch.as_tensor(view.rotation_world_to_camera.copy(), dtype=torch.float64, device=positions.device)
+    camera = torch.as_tensor(view.position.copy(), dtype=torch.float64, device=positions.device)
+    in_camera = ((positions.double() - camera) @ rotation.T).to(positions.dtype)
+    seen = torch.nonzero(in_camera[:, 2] > near)[:, 0]
+    seen = seen[torch.argsort(in_camera[seen, 2], stable=True)]
+    centres, m, to_px2 = project(in_camera[seen], scales[seen], rotations[seen], rotation.to(positions.dtype), view, near)
+    light = positions.new_ones(view.height, view.width)
+    color = positions.new_zeros(features.shape[1], view.height, view.width)
+    for k, i in enumerate(seen):
+        depth = optical_masses[i] * to_px2[k] * splat_weights(centres[k : k + 1], m[k : k + 1], view)[0]
+        color = color - features[i][:, None, None] * light * torch.expm1(-depth)
+        light = light * torch.exp(-depth)
+    return color, 1.0 - light
+
+
 def project(
     p: Tensor,  # [N, 3] m, camera axes
     scales: Tensor,  # [N, 3] m
