@@ -22,7 +22,7 @@ from .gaussians import Gaussians, require_finite
 from .layer_kernels import differentiate_layers, draw_layers
 from .projection_gradient import Found, project_backward
 from .pyramid import make_pyramid
-from .splat import FAINTEST, Geometry, Gradients, check_view, require_image
+from .splat import FAINTEST, Geometry, Gradients, check_view, inputs_of, require_image
 from .splat_kernels import NUM_SUMS, copy_rows, gather, scaled_into
 
 
@@ -104,9 +104,8 @@ def _projected_back(layers: Layers, sums: np.ndarray) -> Found:
         optical_masses=np.zeros(num),
         camera=np.zeros((geometry.num_chunks, 6)),
     )
-    arrays = (gaussians.positions, gaussians.scales, gaussians.rotations, gaussians.optical_masses)
-    inputs = [np.ascontiguousarray(array, np.float64) for array in arrays]
-    project_backward(*inputs, geometry.lens, geometry.num_chunks, geometry.splats, geometry.levels, sums, found)
+    inputs = (*inputs_of(gaussians), np.ascontiguousarray(gaussians.optical_masses, np.float64), geometry.lens)
+    project_backward(*inputs, geometry.num_chunks, geometry.splats, geometry.levels, sums, found)
     return found
 
 
@@ -132,9 +131,7 @@ def _geometry(gaussians: Gaussians, view: View, near: float) -> Geometry:
     splats = np.empty((num, projection.SPLAT_FIELDS))
     levels, boxes = np.empty(num, np.int64), np.empty((num, 4), np.int64)
     num_chunks = max(1, min(64, num // 256))
-    arrays = (gaussians.positions, gaussians.scales, gaussians.rotations)
-    inputs = [np.ascontiguousarray(array, np.float64) for array in arrays]
-    projection.project(*inputs, lens, 1, num_chunks, splats, levels, boxes)
+    projection.project(*inputs_of(gaussians), lens, 1, num_chunks, splats, levels, boxes)
     pyramid = make_pyramid(view.width, view.height, 1)
     bins = bin_splats(pyramid, levels, boxes)
     return Geometry(lens=lens, splats=splats, levels=levels, boxes=boxes, pyramid=pyramid, bins=bins, num_chunks=num_chunks)

@@ -105,7 +105,7 @@ def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
         optical_masses=np.zeros(num),
         camera=np.zeros((geometry.num_chunks, 6)),
     )
-    inputs = (*_inputs(splat.gaussians), splat.optical_masses, geometry.lens, geometry.num_chunks)
+    inputs = (*inputs_of(splat.gaussians), splat.optical_masses, geometry.lens, geometry.num_chunks)
     project_backward(*inputs, geometry.splats, geometry.levels, sums, found)
     camera = found.camera.sum(axis=0)
     return Gradients(
@@ -143,7 +143,8 @@ def require_image(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} is {getattr(array, 'dtype', type(array))} {getattr(array, 'shape', '')}, not float {shape}")
 
 
-def _inputs(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def inputs_of(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, scales and rotations as the kernels take them."""
     arrays = (gaussians.positions, gaussians.scales, gaussians.rotations)
     return tuple(np.ascontiguousarray(array, np.float64) for array in arrays)  # type: ignore[return-value]
 
@@ -155,7 +156,7 @@ def _geometry(gaussians: Gaussians, view: View, near: float) -> Geometry:
     levels = np.empty(num, np.int64)
     boxes = np.empty((num, 4), np.int64)
     num_chunks = max(1, min(64, num // 256))
-    projection.project(*_inputs(gaussians), lens, max_levels(view.width, view.height), num_chunks, splats, levels, boxes)
+    projection.project(*inputs_of(gaussians), lens, max_levels(view.width, view.height), num_chunks, splats, levels, boxes)
     pyramid = make_pyramid(view.width, view.height, 1 + max(0, int(levels.max(initial=0))))
     bins = bin_splats(pyramid, levels, boxes)
     return Geometry(
