@@ -11,6 +11,7 @@ SUN_ELEVATION = 30.0  # degrees: low enough to model the smoke and to throw its 
 _SUN_STRENGTH = 7.0  # W/m^2
 _SUN_SIZE = 1.0  # degrees
 _SKY_STRENGTH = 0.35
+_SKY_SEEN = 0.8  # as the camera sees it: a sky exposed for itself, and shadows that stay dark
 _SKY_MAP = 128  # px high
 
 
@@ -77,7 +78,13 @@ def _add_sky() -> None:
     tree.links.new(cover.outputs[0], mix.inputs[0])
     tree.links.new(ramp.outputs[0], mix.inputs[1])
     background = tree.nodes.new("ShaderNodeBackground")
-    background.inputs["Strength"].default_value = _SKY_STRENGTH
+    path = tree.nodes.new("ShaderNodeLightPath")
+    strength = tree.nodes.new("ShaderNodeMath")
+    strength.operation = "MULTIPLY_ADD"
+    strength.inputs[1].default_value = _SKY_SEEN - _SKY_STRENGTH
+    strength.inputs[2].default_value = _SKY_STRENGTH
+    tree.links.new(path.outputs["Is Camera Ray"], strength.inputs[0])
+    tree.links.new(strength.outputs[0], background.inputs["Strength"])
     tree.links.new(mix.outputs[0], background.inputs["Color"])
     output = tree.nodes.new("ShaderNodeOutputWorld")
     tree.links.new(background.outputs[0], output.inputs["Surface"])
