@@ -20,7 +20,7 @@ from . import projection
 from .binning import bin_splats
 from .gaussians import Gaussians, require_finite
 from .layer_kernels import differentiate_layers, draw_layers
-from .projection_gradient import Found, project_backward
+from .projection_gradient import Found, no_gradients, project_backward
 from .pyramid import make_pyramid
 from .splat import FAINTEST, Geometry, Gradients, check_view, inputs_of, require_image
 from .splat_kernels import NUM_SUMS, copy_rows, gather, scaled_into
@@ -97,13 +97,7 @@ def backward(layers: Layers, grad_color: np.ndarray, grad_opacity: np.ndarray) -
 
 def _projected_back(layers: Layers, sums: np.ndarray) -> Found:
     num, geometry, gaussians = len(layers.order), layers.geometry, layers.gaussians
-    found = Found(
-        positions=np.zeros((num, 3)),
-        scales=np.zeros((num, 3)),
-        rotations=np.zeros((num, 4)),
-        optical_masses=np.zeros(num),
-        camera=np.zeros((geometry.num_chunks, 6)),
-    )
+    found = no_gradients(num, geometry.num_chunks)
     inputs = (*inputs_of(gaussians), np.ascontiguousarray(gaussians.optical_masses, np.float64), geometry.lens)
     project_backward(*inputs, geometry.num_chunks, geometry.splats, geometry.levels, sums, found)
     return found

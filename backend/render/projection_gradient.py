@@ -21,6 +21,17 @@ class Found(NamedTuple):
     camera: np.ndarray  # [chunks, 6]
 
 
+def no_gradients(num: int, num_chunks: int) -> Found:
+    """Zeros for N Gaussians."""
+    return Found(
+        positions=np.zeros((num, 3)),
+        scales=np.zeros((num, 3)),
+        rotations=np.zeros((num, 4)),
+        optical_masses=np.zeros(num),
+        camera=np.zeros((num_chunks, 6)),
+    )
+
+
 @njit(cache=True, forceinline=True)
 def _covariance_gradient(m, level, sums, splat, dm):
     """Gradient with respect to m [6] from the sums of one splat; adds to dm [6]. sums: see splat_kernels, in cells.

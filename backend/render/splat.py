@@ -22,7 +22,7 @@ from . import projection
 from .binning import Bins, bin_splats
 from .composite import composite, composite_backward
 from .gaussians import Gaussians, require_finite
-from .projection_gradient import Found, project_backward
+from .projection_gradient import no_gradients, project_backward
 from .pyramid import Pyramid, make_pyramid, max_levels, upsample, upsample_adjoint
 from .splat_kernels import NUM_SUMS, copy_rows, differentiate, draw, gather, largest_magnitude, scaled_into, weigh
 
@@ -98,13 +98,7 @@ def backward(splat: Splat, grad_image: np.ndarray) -> Gradients:
     gather(slots, bins.slot_starts, geometry.num_chunks, sums)
     sums *= scale
     amplitudes = splat.optical_masses * geometry.splats[:, 5] * geometry.splats[:, 6]
-    found = Found(
-        positions=np.zeros((num, 3)),
-        scales=np.zeros((num, 3)),
-        rotations=np.zeros((num, 4)),
-        optical_masses=np.zeros(num),
-        camera=np.zeros((geometry.num_chunks, 6)),
-    )
+    found = no_gradients(num, geometry.num_chunks)
     inputs = (*inputs_of(splat.gaussians), splat.optical_masses, geometry.lens, geometry.num_chunks)
     project_backward(*inputs, geometry.splats, geometry.levels, sums, found)
     camera = found.camera.sum(axis=0)

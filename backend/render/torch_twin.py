@@ -27,14 +27,11 @@ def render(
     chunk: int = 64,
 ) -> Tensor:
     """[1 + K, H, W]: optical depth, then sums of features weighted by it."""
-    rotation = torch.as_tensor(view.rotation_world_to_camera.copy(), dtype=torch.float64, device=positions.device)
-    camera = torch.as_tensor(view.position.copy(), dtype=torch.float64, device=positions.device)
-    # Far from the origin only float64 keeps the difference; everything after it may be shorter.
-    in_camera = ((positions.double() - camera) @ rotation.T).to(positions.dtype)
+    in_camera, rotation = to_camera(positions, view)
     seen = in_camera[:, 2] > near
     in_camera, scales, rotations = in_camera[seen], scales[seen], rotations[seen]
     masses, features = optical_masses[seen], features[seen]
-    centres, m, to_px2 = project(in_camera, scales, rotations, rotation.to(positions.dtype), view, near)
+    centres, m, to_px2 = project(in_camera, scales, rotations, rotation, view, near)
     image = positions.new_zeros(1 + features.shape[1], view.height, view.width)
     for start in range(0, len(masses), chunk):
         part = slice(start, start + chunk)
@@ -55,12 +52,10 @@ def render_layers(
     near: float = NEAR,
 ) -> tuple[Tensor, Tensor]:
     """The coloured mode (layers.py): premultiplied features [K, H, W] and opacity [H, W], composited front to back."""
-    rotation = torch.as_tensor(view.rotation_world_to_camera.copy(), dtype=torch.float64, device=positions.device)
-    camera = torch.as_tensor(view.position.copy(), dtype=torch.float64, device=positions.device)
-    in_camera = ((positions.double() - camera) @ rotation.T).to(positions.dtype)
+    in_camera, rotation = to_camera(positions, view)
     seen = torch.nonzero(in_camera[:, 2] > near)[:, 0]
     seen = seen[torch.argsort(in_camera[seen, 2], stable=True)]
-    centres, m, to_px2 = project(in_camera[seen], scales[seen], rotations[seen], rotation.to(positions.dtype), view, near)
+    centres, m, to_px2 = project(in_camera[seen], scales[seen], rotations[seen], rotation, view, near)
     light = positions.new_ones(view.height, view.width)
     color = positions.new_zeros(features.shape[1], view.height, view.width)
     for k, i in enumerate(seen):
@@ -68,6 +63,14 @@ def render_layers(
         color = color - features[i][:, None, None] * light * torch.expm1(-depth)
         light = light * torch.exp(-depth)
     return color, 1.0 - light
+
+
+def to_camera(positions: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Positions [N, 3] m in camera axes, and the rotation [3, 3] world to camera."""
+    rotation = torch.as_tensor(view.rotation_world_to_camera.copy(), dtype=torch.float64, device=positions.device)
+    camera = torch.as_tensor(view.position.copy(), dtype=torch.float64, device=positions.device)
+    # Far from the origin only float64 keeps the difference; everything after it may be shorter.
+    return ((positions.double() - camera) @ rotation.T).to(positions.dtype), rotation.to(positions.dtype)
 
 
 def project(
