@@ -27,7 +27,8 @@ from synthetic.layers import Layer, Quality
 from synthetic.presets import PRESETS, Preset
 from synthetic.render import RenderOrder, build_scene
 from synthetic.scene.camera import set_camera
-from synthetic.scene.cycles import render_pixels, set_quality
+from synthetic.scene.cycles import render_light, render_opacity, set_quality
+from synthetic.scene.pixels import srgb
 from synthetic.scene.smoke import show_smoke
 from synthetic.scenes import SCENES
 from synthetic.sweep import orbit_cameras
@@ -132,9 +133,11 @@ def _render(case: Case, preset: Preset, frame: int, *, seed: int) -> tuple[np.nd
     cameras = orbit_cameras(preset.orbit, width=width, height=height, fps=preset.fps, num_frames=preset.num_frames)
     set_camera(cameras, frame)
     set_quality(replace(case.quality, opacity_samples=case.quality.samples), seed=seed)
-    layer = Layer.CLIP if case.layer == "clip" else Layer.SMOKE
     begin = time.perf_counter(), time.process_time()
-    image = render_pixels(layer, parts=(case.layer == "opacity",))
+    if case.layer == "opacity":
+        image = np.repeat(render_opacity()[..., None], 4, axis=2)
+    else:
+        image = render_light(Layer(case.layer))
     return image, time.perf_counter() - begin[0], time.process_time() - begin[1]
 
 
@@ -146,16 +149,10 @@ def errors(case: Case, image: np.ndarray, references: dict[str, np.ndarray]) -> 
     if case.layer == "opacity":
         squares = np.square(image[..., 3:] - target[..., 3:], dtype=np.float64)
     else:
-        squares = np.square(coded(image[..., :3]) - coded(target[..., :3]), dtype=np.float64)
+        squares = np.square(srgb(image[..., :3]) - srgb(target[..., :3]))
     is_smoke = references["opacity"][..., 3] > 0.02
     full, smoke = float(np.sqrt(squares.mean())), float(np.sqrt(squares[is_smoke].mean()))
     return {"full_error": round(full, 6), "smoke_error": round(smoke, 6)}
-
-
-def coded(linear: np.ndarray) -> np.ndarray:
-    """sRGB (IEC 61966-2-1) of linear light, clipped to 0..1."""
-    light = np.clip(linear, 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:

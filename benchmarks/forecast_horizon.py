@@ -21,12 +21,12 @@ import numpy as np
 
 from backend.contract.cameras import read_cameras
 from backend.fit.scene import make_scene
-from backend.io import images
 from backend.io.frame_stack import FrameStack
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.io.records import open_stage_file
 from backend.render.picture import picture
+from backend.score.measures import decibels, squared_errors
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 DEMO = CHECKOUT / "synthetic" / "samples" / "demo_plume.mp4"
@@ -45,9 +45,8 @@ def read_layers(folder: JobFolder) -> list[np.ndarray]:
 
 
 def psnr(shown: np.ndarray, truth: np.ndarray) -> float:
-    """dB of two linear premultiplied images [H, W, 4], compared as sRGB on black; at most 50."""
-    coded = [images.linear_to_srgb(np.clip(image[..., :3], 0.0, 1.0)) for image in (shown, truth)]
-    return min(50.0, float(-10.0 * np.log10(np.mean(np.square(coded[0] - coded[1])) + 1e-12)))
+    """dB of two linear premultiplied images [H, W, 4] over the full frame, compared as sRGB on black; at most 50."""
+    return decibels(squared_errors(shown, truth)[0])
 
 
 def main() -> None:

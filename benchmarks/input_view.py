@@ -19,17 +19,11 @@ from backend.contract.job import read_job
 from backend.contract.result import read_result
 from backend.fit.scene import make_scene
 from backend.io.frame_stack import FrameStack
-from backend.io.images import linear_to_srgb
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.io.records import open_stage_file
 from backend.render.picture import picture
-
-LARGEST_DB = 50.0
-
-
-def decibels(squares: np.ndarray) -> float:
-    return min(LARGEST_DB, float(-10.0 * np.log10(squares.mean(dtype=np.float64) + 1e-12)))
+from backend.score.measures import SMOKE_OPACITY, coded, decibels
 
 
 def measure(job: Path) -> dict:
@@ -40,13 +34,13 @@ def measure(job: Path) -> dict:
         layers = FrameStack(file, "smoke")
         scene = make_scene(layers, read_cameras(folder.cameras))
         for frame in range(result.num_frames):
-            shown = np.clip(picture(particles.frame(frame), scene.views[frame])[..., :3], 0.0, 1.0)
+            shown = picture(particles.frame(frame), scene.views[frame])
             layer = layers[frame]
-            squares = np.square(linear_to_srgb(shown) - linear_to_srgb(layer[..., :3]))
-            full.append(decibels(squares))
-            is_smoke = layer[..., 3] > 0.02
+            squares = np.square(coded(shown) - coded(layer))
+            full.append(decibels(float(squares.mean(dtype=np.float64))))
+            is_smoke = layer[..., 3] > SMOKE_OPACITY
             if is_smoke.sum() > 20:
-                inside.append(decibels(squares[is_smoke]))
+                inside.append(decibels(float(squares[is_smoke].mean(dtype=np.float64))))
         mode = str(file.attrs["mode"])
     return {
         "clip": Path(order.video).name,

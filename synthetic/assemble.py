@@ -7,41 +7,32 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from backend.contract.errors import BackendError
 from backend.contract.result import VDB_NAME
+from backend.contract.truth import CLIP_VIDEO, INPUT_FOLDER, TRUTH_FILE, TRUTH_FOLDER
 from backend.io.atomic import whole_file
 from synthetic.clip import encode_clip
-from synthetic.plan import INPUT_FOLDER, SMOKE_FOLDER, TEST_VIEWS, TRUTH_FOLDER, plan_images
+from synthetic.plan import SMOKE_FOLDER, TEST_VIEWS, Image, plan_images
 from synthetic.presets import Preset
 from synthetic.scenes import SCENES
 
-TRUTH_FILE = "truth.json"
 VOLUME_NAME = "volume_{:04d}.vdb"  # numbered by video frame from 0
 _FORMAT_VERSION = 1
 
 
 def assemble(scene: str, folder: Path, preset: Preset) -> Path:
     """Make input/clip.mp4, truth/volumes and truth/truth.json of a rendered scene. Returns the path of the last."""
-    missing = [image.path for image in plan_images(preset) if not (folder / image.path).exists()]
-    if missing:
-        raise BackendError(
-            "images_missing",
-            f"{len(missing)} images of {folder} are missing, the first is {missing[0]}.",
-            hint="Run `synth render` with the same --out until all are there.",
-        )
+    check_rendered(plan_images(preset), folder, command="synth render")
     num_seen = preset.num_frames - preset.num_future
-    clip = folder / INPUT_FOLDER / "clip.mp4"
+    clip = folder / INPUT_FOLDER / CLIP_VIDEO
     frames = [folder / INPUT_FOLDER / "clip" / f"{frame:04d}.png" for frame in range(num_seen)]
     encode_clip(frames, clip, fps=preset.fps)
     volume_frames = _gather_volumes(folder, preset)
     data = {
-        "format_version": _FORMAT_VERSION,
-        "scene": scene,
-        "purpose": SCENES[scene].purpose,
-        "frames": {"count": preset.num_frames, "seen": num_seen, "fps": preset.fps},
-        "size": [preset.width, preset.height],
+        **scene_facts(scene, folder, preset),
         "views": {name: TEST_VIEWS.get(name, 0.0) for name in preset.views},
         "smoke_every": preset.smoke_every,
         "volumes": {"frames": volume_frames, "name": VOLUME_NAME},
@@ -55,13 +46,35 @@ def assemble(scene: str, folder: Path, preset: Preset) -> Path:
             "plate": "sRGB",
             "cameras": "metres; axes x right, y down, z forward; world z up; pixel centres at +0.5",
         },
-        "render": json.loads((folder / "render.json").read_text(encoding="utf-8")),
-        "simulation": _simulation(folder),
     }
     path = folder / TRUTH_FOLDER / TRUTH_FILE
     with whole_file(path) as part:
         part.write_text(json.dumps(data, indent=2, sort_keys=True, allow_nan=False), encoding="utf-8")
     return path
+
+
+def check_rendered(images: Sequence[Image], folder: Path, *, command: str) -> None:
+    """Raises BackendError where images are missing; command: what makes them."""
+    missing = [image.path for image in images if not (folder / image.path).exists()]
+    if missing:
+        raise BackendError(
+            "images_missing",
+            f"{len(missing)} images of {folder} are missing, the first is {missing[0]}.",
+            hint=f"Run `{command}` with the same --out until all are there.",
+        )
+
+
+def scene_facts(scene: str, folder: Path, preset: Preset) -> dict[str, object]:
+    """What every truth.json says: of the scene, its clip, its images and its simulation."""
+    return {
+        "format_version": _FORMAT_VERSION,
+        "scene": scene,
+        "purpose": SCENES[scene].purpose,
+        "frames": {"count": preset.num_frames, "seen": preset.num_frames - preset.num_future, "fps": preset.fps},
+        "size": [preset.width, preset.height],
+        "render": json.loads((folder / "render.json").read_text(encoding="utf-8")),
+        "simulation": _simulation(folder),
+    }
 
 
 def _gather_volumes(folder: Path, preset: Preset) -> list[int]:

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from backend.contract.cameras import Cameras
+from backend.contract.truth import INPUT_FOLDER, INPUT_VIEW, TRUTH_FOLDER
 from synthetic.layers import Layer
 from synthetic.presets import Preset
 from synthetic.sweep import orbit_cameras, still_cameras
 
-INPUT_FOLDER = "input"
-TRUTH_FOLDER = "truth"
 SMOKE_FOLDER = "smoke"
-INPUT_VIEW = "input"
 SHIPPED_EVERY = {"input": 1, "nvs": 3, "side": 9, "back": 9}  # frames
 TEST_VIEWS = {"nvs": 0.0, "side": 120.0, "back": 180.0}  # degrees that the camera is turned from the first frame's
 

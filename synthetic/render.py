@@ -24,14 +24,12 @@ if __name__ == "__main__":
 import bpy
 
 from backend.contract.errors import EXIT_DONE, EXIT_USER, BackendError
-from backend.contract.result import VDB_NAME
+from backend.contract.result import CAMERAS_FILE, VDB_NAME
+from backend.contract.truth import view_folder
 from synthetic.claims import claimed
 from synthetic.layers import Layer
 from synthetic.plan import (
-    INPUT_FOLDER,
-    INPUT_VIEW,
     SMOKE_FOLDER,
-    TRUTH_FOLDER,
     Image,
     first_frames,
     plan_images,
@@ -198,9 +196,8 @@ def _prepare_folders(order: RenderOrder, images: Sequence[Image]) -> None:
     for folder in {(order.folder / image.path).parent for image in images}:
         folder.mkdir(parents=True, exist_ok=True)
     for view, cameras in view_cameras(order.preset).items():
-        place = Path(INPUT_FOLDER) if view == INPUT_VIEW else Path(TRUTH_FOLDER, view)
         if order.views is None or view in order.views:
-            _write_once(order.folder / place / "cameras.json", cameras.to_json())
+            _write_once(order.folder / view_folder(view) / CAMERAS_FILE, cameras.to_json())
     text = json.dumps(describe(order), indent=2, sort_keys=True)
     if _write_once(order.folder / RENDER_FILE, text) != text:
         raise BackendError(

@@ -23,51 +23,51 @@ import numpy as np
 from scipy import ndimage
 
 from backend.contract.errors import BackendError
-from backend.contract.result import VDB_NAME
+from backend.contract.result import CAMERAS_FILE, VDB_NAME
+from backend.contract.truth import (
+    CLIP_VIDEO,
+    FUTURE_VIDEO,
+    INPUT_FOLDER,
+    INPUT_VIEW,
+    SMOKE_VIDEO,
+    TRUTH_FILE,
+    TRUTH_FOLDER,
+    VOLUMES_FILE,
+    view_folder,
+)
 from backend.io.atomic import whole_file
 from backend.io.hdf5_file import whole_hdf5
 from backend.io.vdb import DenseGrid, read_vdb
+from synthetic.assemble import check_rendered, scene_facts
 from synthetic.clip import encode_clip
 from synthetic.layers import Layer
-from synthetic.plan import INPUT_FOLDER, INPUT_VIEW, SMOKE_FOLDER, TRUTH_FOLDER, Image, plan_shipped, view_cameras
+from synthetic.plan import SMOKE_FOLDER, Image, plan_shipped, view_cameras
 from synthetic.presets import Preset
-from synthetic.scenes import SCENES
 
 SHIPPED_FOLDER = Path(__file__).resolve().parent / "bench"
-TRUTH_FILE = "truth.json"
-SMOKE_VIDEO = "smoke.mkv"
-FUTURE_VIDEO = "future.mkv"
-VOLUMES_FILE = "volumes.h5"
 DENSITY_EVERY, VELOCITY_EVERY = 5, 15  # frames
 _CLIP_QUALITY = 17  # as a camera would keep it; the lossless frames are too large to ship
 _STEPS = {"density": 2.0**-7, "velocity": 2.0**-5}  # 1/m, m/s: finer digits of turbulence would be half of the file
 _FAINT = 0.01  # 1/m: no smoke to see
 _COARSER = 2  # voxels of the simulation along an edge of one that is shipped
-_FORMAT_VERSION = 1
 
 
 def pack(scene: str, folder: Path, preset: Preset, target: Path) -> Path:
     """Pack the rendered scene in `folder` into `target`. Returns the path of truth.json. Raises BackendError."""
     images = plan_shipped(preset)
-    missing = [image.path for image in images if not (folder / image.path).exists()]
-    if missing:
-        raise BackendError(
-            "images_missing",
-            f"{len(missing)} images of {folder} are missing, the first is {missing[0]}.",
-            hint="Run `synth render --shipped` with the same --out until all are there.",
-        )
+    check_rendered(images, folder, command="synth render --shipped")
     num_seen = preset.num_frames - preset.num_future
     (target / TRUTH_FOLDER).mkdir(parents=True, exist_ok=True)
     (target / INPUT_FOLDER).mkdir(parents=True, exist_ok=True)
     clip = [folder / image.path for image in images if image.layer is Layer.CLIP]
-    encode_clip(clip, target / INPUT_FOLDER / "clip.mp4", fps=preset.fps, quality=_CLIP_QUALITY)
+    encode_clip(clip, target / INPUT_FOLDER / CLIP_VIDEO, fps=preset.fps, quality=_CLIP_QUALITY)
     frames: dict[str, list[int]] = {}
     for view, cameras in view_cameras(preset).items():
         smoke = [image for image in images if image.layer is Layer.SMOKE and image.view == view]
         frames[view] = [image.frame for image in smoke]
-        place = target / (INPUT_FOLDER if view == INPUT_VIEW else f"{TRUTH_FOLDER}/{view}")
+        place = target / view_folder(view)
         place.mkdir(parents=True, exist_ok=True)
-        with whole_file(place / "cameras.json") as part:
+        with whole_file(place / CAMERAS_FILE) as part:
             part.write_text(cameras.to_json(), encoding="utf-8")
         seen = [image for image in smoke if view != INPUT_VIEW or image.frame < num_seen]
         encode_smoke(_pictures(folder, seen), place / SMOKE_VIDEO, fps=preset.fps)
@@ -193,13 +193,8 @@ def _write_truth(
         for file in sorted(target.rglob("*"))
         if file.is_file() and file != path
     }
-    simulation = json.loads((folder / SMOKE_FOLDER / "smoke.json").read_text(encoding="utf-8"))
     data = {
-        "format_version": _FORMAT_VERSION,
-        "scene": scene,
-        "purpose": SCENES[scene].purpose,
-        "frames": {"count": preset.num_frames, "seen": preset.num_frames - preset.num_future, "fps": preset.fps},
-        "size": [preset.width, preset.height],
+        **scene_facts(scene, folder, preset),
         "views": frames,
         "volumes": volumes,
         "units": {
@@ -208,8 +203,6 @@ def _write_truth(
             "smoke": "8-bit: light premultiplied with opacity, sRGB-coded; 4th channel opacity, not coded",
             "cameras": "metres; axes x right, y down, z forward; world z up; pixel centres at +0.5",
         },
-        "render": json.loads((folder / "render.json").read_text(encoding="utf-8")),
-        "simulation": simulation,
         "sha256": made,
     }
     with whole_file(path) as part:

@@ -76,6 +76,14 @@ def _ray(camera, row, column, direction):  # pixel -> unit vector in the world
 
 
 @njit(cache=True, inline="always")
+def _along(camera, direction, distance, origin, h):  # where a ray is, in voxels from the first one's centre
+    x = (camera[9] + distance * direction[0] - origin[0]) / h
+    y = (camera[10] + distance * direction[1] - origin[1]) / h
+    z = (camera[11] + distance * direction[2] - origin[2]) / h
+    return x, y, z
+
+
+@njit(cache=True, inline="always")
 def _span(camera, direction, low, high):  # -> first and last distance inside the box, the first larger where there is none
     near, far = 0.0, 1e30
     for axis in range(3):
@@ -102,9 +110,7 @@ def _march(density, origin, h, camera, step, image):
             first, last = math.ceil(near / step), math.floor(far / step)
             total = 0.0
             for index in range(first, last + 1):
-                x = (camera[9] + index * step * direction[0] - origin[0]) / h
-                y = (camera[10] + index * step * direction[1] - origin[1]) / h
-                z = (camera[11] + index * step * direction[2] - origin[2]) / h
+                x, y, z = _along(camera, direction, index * step, origin, h)
                 i, j, k = math.floor(x), math.floor(y), math.floor(z)
                 fx, fy, fz = x - i, y - j, z - k
                 for a in range(2):
@@ -139,9 +145,7 @@ def _spread(image, origin, h, camera, step, density):
                 near, far = _span(camera, direction, low, high)
                 first, last = math.ceil(near / step), math.floor(far / step)
                 for index in range(first, last + 1):
-                    x = (camera[9] + index * step * direction[0] - origin[0]) / h
-                    y = (camera[10] + index * step * direction[1] - origin[1]) / h
-                    z = (camera[11] + index * step * direction[2] - origin[2]) / h
+                    x, y, z = _along(camera, direction, index * step, origin, h)
                     i, j, k = math.floor(x), math.floor(y), math.floor(z)
                     fx, fy, fz = x - i, y - j, z - k
                     for a in range(2):

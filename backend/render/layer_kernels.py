@@ -16,7 +16,7 @@ from numba import njit, prange
 
 from .binning import BAND_ROWS
 from .lanes import LANES, absorbed, add, exponential, load, muladd, multiply, ramp, spread, store, total
-from .splat_kernels import NUM_SUMS, _place, _row
+from .splat_kernels import NUM_SUMS, place_of, row_of
 
 
 @njit(cache=True, parallel=True)
@@ -29,7 +29,7 @@ def draw_layers(buffer, pyramid, bins, splats, boxes, amplitudes, features, num_
     for task in prange(num_tasks):
         for k in range(task, bins.order.shape[0], num_tasks):
             band = bins.order[k]
-            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            start, plane, stride, num_columns, first_row, stop_row = place_of(pyramid, bins, band, 1 + num_features)
             for c in range(1 + num_features):
                 value = np.float32(0) if c else np.float32(1)
                 buffer[start + c * plane + first_row * stride : start + c * plane + stop_row * stride] = value
@@ -41,7 +41,7 @@ def draw_layers(buffer, pyramid, bins, splats, boxes, amplitudes, features, num_
                 slope, strength = spread(np.float32(-0.5 * a)), spread(amplitudes[i])
                 minus, step = spread(np.float32(-1)), spread(np.float32(LANES))
                 for row in range(max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)):
-                    first, count, t0, exponent, _ = _row(u, v, a, b, s, boxes[i, 2], boxes[i, 3], row, num_columns)
+                    first, count, t0, exponent, _ = row_of(u, v, a, b, s, boxes[i, 2], boxes[i, 3], row, num_columns)
                     t, peak = ramp(t0), spread(exponent)
                     at = start + row * stride + first
                     for place in range(at, at + count, LANES):
@@ -71,7 +71,7 @@ def differentiate_layers(gradient, pyramid, bins, splats, boxes, amplitudes, fea
         spent = np.empty(BAND_ROWS * pyramid.strides[0], np.float32)
         for k in range(task, bins.order.shape[0], num_tasks):
             band = bins.order[k]
-            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            start, plane, stride, num_columns, first_row, stop_row = place_of(pyramid, bins, band, 1 + num_features)
             passing[:] = np.float32(1)
             spent[:] = zero
             for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
@@ -96,7 +96,7 @@ def _differentiate_one(
     for c in range(num_features):
         store(scratch, c * LANES, zero)
     for row in range(first_row, stop_row):
-        first, count, t0, exponent, dy = _row(u, v, a, b, s, boxes[i, 2], boxes[i, 3], row, num_columns)
+        first, count, t0, exponent, dy = row_of(u, v, a, b, s, boxes[i, 2], boxes[i, 3], row, num_columns)
         t, peak = ramp(t0), spread(exponent)
         r0, r1, r2 = zero, zero, zero
         shift = start + band_row * stride

@@ -22,7 +22,7 @@ NUM_SUMS = 6  # of w g (S0), w g t (S1), w g t^2 (S2), w g dy (Y1), w g dy^2 (Y2
 
 
 @njit(cache=True, forceinline=True)
-def _row(u, v, a, b, s, left, right, row, num_columns):
+def row_of(u, v, a, b, s, left, right, row, num_columns):
     """One row of a splat: first cell, number of cells rounded up to LANES (0: none), t there, exponent at t = 0, dy.
 
     A narrow splat takes its whole box in every row: finding each row's own span would cost more than it saves.
@@ -39,7 +39,7 @@ def _row(u, v, a, b, s, left, right, row, num_columns):
 
 
 @njit(cache=True, forceinline=True)
-def _place(pyramid, bins, band, num_channels):
+def place_of(pyramid, bins, band, num_channels):
     """Of a band: element where its level starts, elements per channel and per row, columns, first row, row after the last."""
     level = bins.band_levels[band]
     rows, stride = pyramid.rows[level], pyramid.strides[level]
@@ -65,7 +65,7 @@ def draw(buffer, pyramid, bins, splats, boxes, amplitudes, features, num_tasks):
         tints = np.empty(num_features, np.float32)
         for k in range(task, bins.order.shape[0], num_tasks):
             band = bins.order[k]
-            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            start, plane, stride, num_columns, first_row, stop_row = place_of(pyramid, bins, band, 1 + num_features)
             for c in range(1 + num_features):
                 buffer[start + c * plane + first_row * stride : start + c * plane + stop_row * stride] = np.float32(0)
             for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
@@ -85,7 +85,7 @@ def _draw_one(buffer, start, plane, stride, num_columns, first_row, stop_row, sp
     step = spread(np.float32(LANES))
     strength = spread(amplitude)
     for row in range(first_row, stop_row):
-        first, count, t0, exponent, _ = _row(u, v, a, b, s, left, right, row, num_columns)
+        first, count, t0, exponent, _ = row_of(u, v, a, b, s, left, right, row, num_columns)
         t = ramp(t0)
         peak = spread(exponent)
         at = start + row * stride + first
@@ -109,7 +109,7 @@ def differentiate(gradient, pyramid, bins, splats, boxes, features, num_tasks, s
         scratch = np.empty(LANES * num_features, np.float32)
         for k in range(task, bins.order.shape[0], num_tasks):
             band = bins.order[k]
-            start, plane, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1 + num_features)
+            start, plane, stride, num_columns, first_row, stop_row = place_of(pyramid, bins, band, 1 + num_features)
             for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
                 i, slot = bins.pair_splats[e], bins.pair_slots[e]
                 low, high = max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)
@@ -132,7 +132,7 @@ def _differentiate_one(
     for c in range(num_features):
         store(scratch, c * LANES, zero)
     for row in range(first_row, stop_row):
-        first, count, t0, exponent, dy = _row(u, v, a, b, s, left, right, row, num_columns)
+        first, count, t0, exponent, dy = row_of(u, v, a, b, s, left, right, row, num_columns)
         t = ramp(t0)
         peak = spread(exponent)
         r0, r1, r2 = zero, zero, zero
@@ -168,7 +168,7 @@ def weigh(gradient, pyramid, bins, splats, boxes, num_tasks, slots):
     for task in prange(num_tasks):
         for k in range(task, bins.order.shape[0], num_tasks):
             band = bins.order[k]
-            start, _, stride, num_columns, first_row, stop_row = _place(pyramid, bins, band, 1)
+            start, _, stride, num_columns, first_row, stop_row = place_of(pyramid, bins, band, 1)
             for e in range(bins.band_starts[band], bins.band_starts[band + 1]):
                 i = bins.pair_splats[e]
                 low, high = max(first_row, boxes[i, 0]), min(stop_row, boxes[i, 1] + 1)
@@ -183,7 +183,7 @@ def _weigh_one(gradient, start, stride, num_columns, first_row, stop_row, splats
     step = spread(np.float32(LANES))
     s0 = spread(np.float32(0))
     for row in range(first_row, stop_row):
-        first, count, t0, exponent, _ = _row(u, v, a, b, s, left, right, row, num_columns)
+        first, count, t0, exponent, _ = row_of(u, v, a, b, s, left, right, row, num_columns)
         t = ramp(t0)
         peak = spread(exponent)
         at = start + row * stride + first

@@ -12,9 +12,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from backend.contract.truth import INPUT_VIEW
 from backend.geometry.camera import View
 from backend.score import baselines, measures
-from backend.score.truth_set import INPUT_VIEW, TruthSet, Volume
+from backend.score.truth_set import TruthSet, Volume
 
 THIRDS = ("first", "middle", "last")
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.errors import BackendError
+from backend.contract.result import CAMERAS_FILE
+from backend.contract.truth import FUTURE_VIDEO, INPUT_VIEW, SMOKE_VIDEO, TRUTH_FILE, TRUTH_FOLDER, VOLUMES_FILE, view_folder
 from backend.geometry.camera import View, view_at
 from backend.io.images import decode_srgb
-
-INPUT_VIEW = "input"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,11 +47,10 @@ class TruthSet:
 
     def pictures(self, name: str) -> np.ndarray:
         """[F, H, W, 4] float32 smoke on black: linear light premultiplied, and opacity; F as in frames[name]."""
-        if name == INPUT_VIEW:
-            parts = [self.folder / "input" / "smoke.mkv", self.folder / "truth" / "future.mkv"]
-            found = np.concatenate([_read_smoke(path) for path in parts if path.exists()])
-        else:
-            found = _read_smoke(self.folder / "truth" / name / "smoke.mkv")
+        found = _read_smoke(self.folder / view_folder(name) / SMOKE_VIDEO)
+        future = self.folder / TRUTH_FOLDER / FUTURE_VIDEO
+        if name == INPUT_VIEW and future.exists():
+            found = np.concatenate([found, _read_smoke(future)])
         if len(found) != len(self.frames[name]):
             raise BackendError(
                 "truth_broken",
@@ -62,12 +61,12 @@ class TruthSet:
 
     def volume_frames(self, *, with_velocity: bool = False) -> list[int]:
         """The video frames that there is a volume of."""
-        with h5py.File(self.folder / "truth" / "volumes.h5") as file:
+        with h5py.File(self.folder / TRUTH_FOLDER / VOLUMES_FILE) as file:
             return [int(frame) for frame in file["velocity_frames" if with_velocity else "density_frames"][:]]  # type: ignore[index]
 
     def volume(self, frame: int) -> Volume:
         """The true smoke at a frame of volume_frames(). Raises KeyError where there is none."""
-        with h5py.File(self.folder / "truth" / "volumes.h5") as file:
+        with h5py.File(self.folder / TRUTH_FOLDER / VOLUMES_FILE) as file:
             density = _at(file, "density", frame)
             if density is None:
                 raise KeyError(frame)
@@ -81,7 +80,7 @@ class TruthSet:
 
 def read_truth_set(folder: Path) -> TruthSet:
     """Raises BackendError where the folder holds no packed scene."""
-    path = folder / "truth" / "truth.json"
+    path = folder / TRUTH_FOLDER / TRUTH_FILE
     try:
         truth: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         frames = {name: [int(frame) for frame in found] for name, found in truth["views"].items()}
@@ -91,7 +90,6 @@ def read_truth_set(folder: Path) -> TruthSet:
         raise BackendError(
             "truth_missing", f"{folder} holds no benchmark scene: {error}.", hint="Give a folder that `synth ship` made."
         ) from error
-    places = {view: folder / ("input" if view == INPUT_VIEW else f"truth/{view}") / "cameras.json" for view in frames}
     return TruthSet(
         folder=folder,
         name=name,
@@ -99,7 +97,7 @@ def read_truth_set(folder: Path) -> TruthSet:
         num_seen=counts[1],
         fps=counts[2],
         frames=frames,
-        cameras={view: read_cameras(place) for view, place in places.items()},
+        cameras={view: read_cameras(folder / view_folder(view) / CAMERAS_FILE) for view in frames},
     )
 
 

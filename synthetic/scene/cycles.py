@@ -58,7 +58,7 @@ def render_image(path: Path, layer: Layer) -> None:
     # The process number keeps two workers apart, should a claim ever fail on a shared folder.
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     if layer is Layer.SMOKE:
-        part.write_bytes(encode_png(render_pixels(layer)))
+        part.write_bytes(encode_png(render_smoke()))
     elif layer is Layer.DEPTH:
         _prepare(layer)
         with _depth_instead_of_light():
@@ -74,30 +74,36 @@ def render_image(path: Path, layer: Layer) -> None:
     os.replace(part, path)
 
 
-def render_pixels(layer: Layer, *, parts: tuple[bool, ...] = (False, True)) -> np.ndarray:
-    """[H, W, 4] linear light and opacity of the scene as it stands.
+def render_smoke() -> np.ndarray:
+    """[H, W, 4] linear: smoke alone, its premultiplied light and its opacity.
 
-    Of smoke, light (False of `parts`) and opacity (True) are two renders: Cycles draws lots for the opacity of what
-    scatters, and the denoiser leaves it alone; of what only absorbs, the opacity is integrated along the ray.
+    Two renders: Cycles draws lots for the opacity of what scatters, and the denoiser leaves it alone; of what only absorbs,
+    the opacity is integrated along the ray.
     """
+    image = render_light(Layer.SMOKE)
+    image[..., 3] = render_opacity()
+    return image
+
+
+def render_light(layer: Layer) -> np.ndarray:
+    """[H, W, 4] linear light of the scene as it stands; the fourth channel is what Cycles takes for opacity."""
     _prepare(layer)
+    with _smoke_only() if layer is Layer.SMOKE else nullcontext():
+        return _rendered()
+
+
+def render_opacity() -> np.ndarray:
+    """[H, W] opacity of the smoke alone."""
+    _prepare(Layer.SMOKE)
+    with _smoke_only(), _absorption_instead_of_light():
+        return _rendered()[..., 3]
+
+
+def _rendered() -> np.ndarray:
     with TemporaryDirectory() as folder:
         path = Path(folder, "image.exr")
-        if layer is not Layer.SMOKE:
-            _render_exr(path)
-            return read_exr(path)
-        image = None
-        with _smoke_only():
-            for is_opacity in parts:
-                with _absorption_instead_of_light() if is_opacity else nullcontext():
-                    _render_exr(path)
-                found = read_exr(path)
-                if image is None:
-                    image = found
-                else:
-                    image[..., 3] = found[..., 3]
-        assert image is not None
-        return image
+        _render_exr(path)
+        return read_exr(path)
 
 
 def _prepare(layer: Layer) -> None:

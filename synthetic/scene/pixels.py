@@ -25,11 +25,16 @@ def read_exr(path: Path) -> np.ndarray:
     return pixels.reshape(height, width, 4)[::-1].copy()
 
 
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Coded values 0..1, float64, of linear light (IEC 61966-2-1), clipped."""
+    light = np.clip(linear.astype(np.float64), 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
 def encode_png(image: np.ndarray) -> bytes:  # [H, W, 4] linear
     """A 16-bit RGBA PNG (ISO 15948): colour sRGB-coded, the fourth channel as it is; both clipped to 0..1."""
-    linear = np.clip(image.astype(np.float64), 0, 1)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
-    coded[..., 3] = linear[..., 3]
+    coded = srgb(image)
+    coded[..., 3] = np.clip(image[..., 3], 0, 1)
     words = np.rint(coded * 65535).astype(">u2")
     height, width = words.shape[:2]
     rows = np.zeros((height, 1 + width * 8), np.uint8)  # each row begins with its filter, 0: none

@@ -17,7 +17,7 @@ _MARGIN = 4.0  # px around the smoke's box
 _CORNER = (0.0, 0.0), (0.1, 0.1)
 
 
-def show_smoke(path: Path | None, *, albedo: tuple[float, float, float] = (0.9, 0.885, 0.87)) -> None:
+def show_smoke(path: Path | None, *, albedo: tuple[float, float, float]) -> None:
     """Show the grids of a VDB file; None: no smoke. albedo, linear RGB, counts when the smoke is first shown."""
     item = bpy.data.objects.get(_NAME)
     if item is None:

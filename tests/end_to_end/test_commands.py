@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_job import assert_whole, backend, digest, settings
+from small_job import assert_whole, backend, backend_command, digest, environment, settings
 
 from backend.contract import events
 from backend.contract.result import read_result
@@ -144,8 +144,6 @@ def test_two_backends_never_work_in_one_folder(job: Path, plume: Path) -> None:
 
 def test_end_of_input_stops_the_run(plume: Path, tmp_path: Path) -> None:
     """Blender died: standard input ends, the backend leaves soon and the job can go on."""
-
-    from test_resume import backend_command, environment  # same process helpers
 
     folder = tmp_path / "job"
     slow = settings(**{"visual.iterations": "400", "visual.mass_iterations": "200"})

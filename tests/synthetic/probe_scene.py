@@ -39,7 +39,7 @@ def main(folder: Path, smoke: Path) -> None:
         render_image(folder / f"ball_{index}.png", Layer.PLATE)
         render_image(folder / f"ball_{index}.exr", Layer.DEPTH)
         bpy.data.objects.remove(ball)
-    show_smoke(smoke)
+    show_smoke(smoke, albedo=(0.9, 0.9, 0.9))
     for index in range(len(cameras.camera_to_world)):
         set_camera(cameras, index)
         render_image(folder / f"smoke_{index}.png", Layer.SMOKE)

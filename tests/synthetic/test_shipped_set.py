@@ -15,12 +15,13 @@ import pytest
 
 from backend.contract.cameras import read_cameras
 from backend.contract.errors import BackendError
+from backend.contract.truth import VOLUMES_FILE
 from backend.io import vdb
 from synthetic.layers import Layer
 from synthetic.plan import plan_shipped
 from synthetic.presets import PRESETS
 from synthetic.record import main as record_main
-from synthetic.shipped import SHIPPED_FOLDER, VOLUMES_FILE, encode_smoke, in_8_bits, pack, pack_volumes
+from synthetic.shipped import SHIPPED_FOLDER, encode_smoke, in_8_bits, pack, pack_volumes
 
 TINY = PRESETS["tiny"]
 
