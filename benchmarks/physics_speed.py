@@ -1,4 +1,4 @@
-"""Speed of the fluid: wall milliseconds of a step, its neighbour lists, interpolation and smoothing. JSON on stdout.
+"""Speed of the fluid: wall milliseconds of a step, its gradient, neighbour lists, interpolation and smoothing. JSON on stdout.
 
     python -m benchmarks.physics_speed [--particles 1000 10000] [--repeats 20] [--threads N]
 
@@ -22,6 +22,7 @@ import numba
 import numpy as np
 
 from backend.physics.fluid import FluidParameters, FluidState, derive_parameters, step
+from backend.physics.fluid_gradient import rollout
 from backend.physics.interpolate import interpolate_velocity, smooth
 from backend.physics.neighbours import find_neighbours
 from backend.physics.threads import threads_for
@@ -69,9 +70,15 @@ def measure(num: int, repeats: int) -> dict[str, object]:
         with threads_for(num):
             find_neighbours(state.positions, 1.1 * length)
 
+    moved = rollout(state, parameters, SECONDS)
+    gradients = [None, moved.states[1].positions]
     return {
         "particles": num,
         "step_ms": timed(lambda: step(state, parameters, SECONDS), repeats),
+        "recorded_step_ms": timed(lambda: rollout(state, parameters, SECONDS), repeats),
+        "step_backward_ms": timed(lambda: moved.backward(gradients), repeats),
+        "tape_mib": round(moved.num_bytes / 2**20, 2),
+        "substeps": moved.reports[0].substeps,
         "neighbours_ms": timed(lists, repeats),
         "interpolate_ms": timed(lambda: interpolate_velocity(points, state, length), repeats),
         "smooth_ms": timed(lambda: smooth(state.velocities, state, length), repeats),

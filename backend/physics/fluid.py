@@ -12,7 +12,9 @@ any. Macklin & Mueller 2013; Macklin et al. 2014, "Unified Particle Physics" for
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -26,6 +28,8 @@ from .state import LARGEST, FluidParameters, FluidState, StepReport
 from .threads import threads_for
 
 __all__ = ["FluidParameters", "FluidState", "StepReport", "derive_parameters", "lattice_density", "number_density", "step"]
+
+S = TypeVar("S", bound=Solver)
 
 SPACINGS_PER_LENGTH = 2.2  # smoothing length over particle spacing
 
@@ -106,14 +110,32 @@ def step(
     dt: float,  # s
 ) -> tuple[FluidState, StepReport]:
     """The state `dt` seconds later. Raises ValueError if a number is not finite. Equal input, equal bytes."""
+    after, report, _, _ = step_with(Solver, state, parameters, dt)
+    return after, report
+
+
+def step_with(
+    make_solver: Callable[..., S],  # Solver, or a kind of it that watches
+    state: FluidState,
+    parameters: FluidParameters,
+    dt: float,  # s
+) -> tuple[FluidState, StepReport, S, np.ndarray]:  # order [N]
+    """`step`, with the solver it went through and the order [N] in which that held the particles."""
     _check(state, dt)
     num = len(state.positions)
     wanted = _wanted_substeps(state, parameters, dt)
     substeps = int(min(wanted, parameters.max_substeps))
+    order = build_grid(state.positions / parameters.smoothing_length, 1.0).order  # neighbours near each other in memory
+    solver = make_solver(
+        state.positions[order] / parameters.smoothing_length,
+        np.asarray(state.ids, np.int64)[order],
+        rest_density=parameters.rest_density * parameters.smoothing_length**3,
+    )
     if num == 0:
-        return state, StepReport(substeps=1, wanted_substeps=1.0, num_clamped=0, overdensity=0.0, list_builds=0)
+        report = StepReport(substeps=1, wanted_substeps=1.0, num_clamped=0, overdensity=0.0, list_builds=0)
+        return state, report, solver, order
     with threads_for(num):
-        positions, velocities, num_clamped, solver = _substeps(state, parameters, dt / substeps, substeps)
+        positions, velocities, num_clamped = _substeps(solver, state.velocities, order, parameters, dt / substeps, substeps)
     report = StepReport(
         substeps=substeps,
         wanted_substeps=wanted,
@@ -121,30 +143,29 @@ def step(
         overdensity=solver.overdensity,
         list_builds=solver.list_builds,
     )
-    return replace(state, positions=positions, velocities=velocities), report
+    return replace(state, positions=positions, velocities=velocities), report, solver, order
 
 
 def _substeps(
-    state: FluidState, parameters: FluidParameters, seconds: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, int, Solver]:
+    solver: Solver,
+    velocities: np.ndarray,  # [N, 3] m/s
+    order: np.ndarray,  # [N]
+    parameters: FluidParameters,
+    seconds: float,
+    substeps: int,
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Positions [N, 3] m and velocities [N, 3] m/s after `substeps` of `seconds` each, and how many were clamped."""
-    num, length = len(state.positions), parameters.smoothing_length
-    order = build_grid(state.positions / length, 1.0).order  # neighbours near each other in memory
-    solver = Solver(
-        state.positions[order] / length,
-        np.asarray(state.ids, np.int64)[order],
-        rest_density=parameters.rest_density * length**3,
-    )
-    motion = state.velocities[order] * (seconds / length)
+    length = parameters.smoothing_length
+    motion = velocities[order] * (seconds / length)
     num_clamped = 0
     for _ in range(substeps):
         motion, num_slowed = limited(forced(motion, parameters, seconds))
         num_clamped += num_slowed
         motion = solver.advance(motion, parameters, seconds)
-    positions, velocities = np.empty((num, 3)), np.empty((num, 3))
-    positions[order] = solver.positions * length
-    velocities[order] = motion * (length / seconds)
-    return positions, velocities, num_clamped, solver
+    positions_after, velocities_after = np.empty((len(order), 3)), np.empty((len(order), 3))
+    positions_after[order] = solver.positions * length
+    velocities_after[order] = motion * (length / seconds)
+    return positions_after, velocities_after, num_clamped
 
 
 def _check(state: FluidState, dt: float) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .colliders import deflect, push_out
+from .colliders import Collider, HalfSpace, Sphere
 from .kernels import POLY6, SPIKY_SLOPE, SPIKY_SQUARED_GRADIENT
 from .projection import COINCIDENT, separation
 from .solver import EPSILON_SHARE, MAX_SHIFT, MAX_TRAVEL, RELAXATION
@@ -48,6 +48,15 @@ class Pairs:
         return torch.zeros((num, *values.shape[1:]), dtype=values.dtype, device=values.device).index_add(0, self.first, values)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Air:
+    """What surrounds the particles, as tensors that may ask for gradients."""
+
+    buoyancy: Tensor  # [3] m/s^2
+    wind: Tensor  # [3] m/s
+    drag: Tensor  # [] 1/s
+
+
 def find_pairs(
     positions: Tensor,  # [N, 3] h
 ) -> Pairs:
@@ -72,29 +81,41 @@ def step_torch(
     ids: Tensor,  # [N] int64
     parameters: FluidParameters,
     dt: float,  # s
+    *,
+    air: Air | None = None,  # in place of what the parameters say
 ) -> tuple[Tensor, Tensor]:  # [N, 3] m, [N, 3] m/s
-    """Positions and velocities `dt` seconds later. Finite input is the caller's business."""
-    length = parameters.smoothing_length
-    pull = _vector(parameters.buoyancy, positions) + parameters.drag * _vector(parameters.wind, positions)
-    after = (velocities + dt * pull) / (1.0 + parameters.drag * dt)
+    """Positions and velocities `dt` seconds later. Finite input is the caller's business.
+
+    Differentiable by everything that is a tensor, on the side of each choice that was taken.
+    """
+    length, air = parameters.smoothing_length, air or _air_of(parameters, positions)
+    pull = air.buoyancy + air.drag * air.wind
+    after = (velocities + dt * pull) / (1.0 + air.drag * dt)
     fastest = max((float(v.detach().norm(dim=1).max()) for v in (velocities, after) if len(v)), default=0.0)
     wanted = math.ceil(fastest * (dt / (MAX_TRAVEL * length)) - 1e-9)
     substeps = min(max(1, wanted), parameters.max_substeps)
     seconds = dt / substeps
     x, u = positions / length, velocities * (seconds / length)
     for _ in range(substeps):
-        u = (u + pull * seconds * (seconds / length)) / (1.0 + parameters.drag * seconds)
+        u = (u + pull * seconds * (seconds / length)) / (1.0 + air.drag * seconds)
         speed = u.norm(dim=1, keepdim=True)
         u = torch.where(speed > MAX_TRAVEL * (1.0 + 1e-9), u * (MAX_TRAVEL / speed.clamp(min=MAX_TRAVEL)), u)
-        x, u = _substep(x, u, ids, parameters, seconds)
+        x, u = _substep(x, u, ids, parameters, seconds, air.wind)
     return x * length, u * (length / seconds)
+
+
+def _air_of(parameters: FluidParameters, like: Tensor) -> Air:
+    drag = torch.tensor(parameters.drag, dtype=like.dtype, device=like.device)
+    return Air(buoyancy=_vector(parameters.buoyancy, like), wind=_vector(parameters.wind, like), drag=drag)
 
 
 def _vector(values: tuple[float, float, float], like: Tensor) -> Tensor:
     return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
-def _substep(x: Tensor, u: Tensor, ids: Tensor, parameters: FluidParameters, seconds: float) -> tuple[Tensor, Tensor]:
+def _substep(
+    x: Tensor, u: Tensor, ids: Tensor, parameters: FluidParameters, seconds: float, wind: Tensor
+) -> tuple[Tensor, Tensor]:
     """Positions and motion one substep on; u holds the forces already."""
     rest_density = parameters.rest_density * parameters.smoothing_length**3
     squares_at_rest = SPIKY_SQUARED_GRADIENT / rest_density
@@ -110,13 +131,14 @@ def _substep(x: Tensor, u: Tensor, ids: Tensor, parameters: FluidParameters, sec
         active = excess if parameters.pulls_when_sparse else excess.clamp(min=0.0)
         lambdas = -active / (squares + EPSILON_SHARE * squares_at_rest)
         if iteration == 0:
-            shares = torch.where(rates > 0.0, rates / torch.maximum(excess, rates.clamp(min=1e-300)), 0.0)
+            safe = torch.where(rates > 0.0, rates, 1.0)
+            shares = torch.where(rates > 0.0, safe / torch.maximum(excess, safe), 0.0)
         shifts, impulses = _corrections(pairs, gradients, lambdas, shares, parameters, squares_at_rest)
         total = total + impulses
         x = _pushed_out(x + shifts, parameters)
-    squared = float((total.detach() ** 2).sum())
-    kept = min(1.0, max(0.0, -2.0 * float((u * total).detach().sum()) / squared)) if squared > 0.0 else 0.0
-    u = _stirred(x, u + kept * total, parameters, seconds)
+    squared = (total**2).sum()
+    kept = (-2.0 * (u * total).sum() / squared).clamp(0.0, 1.0) if float(squared.detach()) > 0.0 else 0.0
+    u = _stirred(x, u + kept * total, parameters, seconds, wind)
     return x, _deflected(x, u, parameters)
 
 
@@ -158,24 +180,23 @@ def _corrections(
     impulse = (moving[pairs.first] + moving[pairs.second])[:, None] * gradients
     shifts, impulses = pairs.total(pressure, num), pairs.total(impulse, num)
     lengths = RELAXATION * shifts.norm(dim=1)
-    largest = float(lengths.detach().max()) if num else 0.0
-    if largest > MAX_SHIFT:
+    scale = RELAXATION
+    if num and float(lengths.detach().max()) > MAX_SHIFT:
         factors = MAX_SHIFT / lengths.clamp(min=MAX_SHIFT)
         limit = torch.minimum(factors[pairs.first], factors[pairs.second])[:, None]
         shifts, impulses = pairs.total(limit * pressure, num), pairs.total(limit * impulse, num)
-        largest = RELAXATION * float(shifts.detach().norm(dim=1).max())
-    scale = RELAXATION * min(1.0, MAX_SHIFT / max(largest, 1e-300))
+        scale = RELAXATION * MAX_SHIFT / (RELAXATION * shifts.norm(dim=1).max()).clamp(min=MAX_SHIFT)
     return scale * shifts, scale * impulses
 
 
-def _stirred(x: Tensor, u: Tensor, parameters: FluidParameters, seconds: float) -> Tensor:
+def _stirred(x: Tensor, u: Tensor, parameters: FluidParameters, seconds: float, wind: Tensor) -> Tensor:
     """Drag at the surface, viscosity and vorticity confinement."""
     pairs, num = find_pairs(x), len(x)
     density = _density(pairs, num)
     if parameters.surface_drag > 0.0:
         exposed = (1.0 - density / (parameters.rest_density * parameters.smoothing_length**3)).clamp(min=0.0)
         drag = (parameters.surface_drag * seconds * exposed)[:, None]
-        u = (u + drag * _vector(parameters.wind, x) * (seconds / parameters.smoothing_length)) / (1.0 + drag)
+        u = (u + drag * wind * (seconds / parameters.smoothing_length)) / (1.0 + drag)
     if parameters.viscosity > 0.0:
         weights = pairs.poly6 / torch.maximum(density[pairs.first], density[pairs.second])
         relative = u[pairs.second] - u[pairs.first]
@@ -193,17 +214,33 @@ def _stirred(x: Tensor, u: Tensor, parameters: FluidParameters, seconds: float) 
 
 
 def _pushed_out(x: Tensor, parameters: FluidParameters) -> Tensor:
-    length, colliders = parameters.smoothing_length, parameters.colliders
-    if not colliders:
-        return x
-    outside = push_out(x.detach().cpu().numpy().astype(np.float64) * length, colliders) / length
-    return torch.as_tensor(outside, dtype=x.dtype, device=x.device)
+    x = x * parameters.smoothing_length if parameters.colliders else x
+    for collider in parameters.colliders:
+        distances, normals = _distances(collider, x)
+        x = x - distances.clamp(max=0.0)[:, None] * normals
+    return x / parameters.smoothing_length if parameters.colliders else x
 
 
 def _deflected(x: Tensor, u: Tensor, parameters: FluidParameters) -> Tensor:
-    length, colliders = parameters.smoothing_length, parameters.colliders
-    if not colliders:
-        return u
-    positions, motion = (t.detach().cpu().numpy().astype(np.float64) for t in (x, u))
-    deflected = deflect(motion, positions * length, colliders, margin=1e-6 * length)
-    return torch.as_tensor(deflected, dtype=u.dtype, device=u.device)
+    for collider in parameters.colliders:
+        distances, normals = _distances(collider, x * parameters.smoothing_length)
+        along = (u * normals).sum(dim=1)
+        is_hit = (distances <= 1e-6 * parameters.smoothing_length) & (along < 0.0)
+        u = torch.where(is_hit[:, None], (1.0 - collider.friction) * (u - along[:, None] * normals), u)
+    return u
+
+
+def _distances(collider: Collider, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distances [N] m and normals [N, 3]. Differentiable for planes and balls; others count as flat."""
+    if isinstance(collider, HalfSpace):
+        normal = _vector(collider.normal, positions) / math.hypot(*collider.normal)
+        return (positions - _vector(collider.point, positions)) @ normal, normal.expand_as(positions)
+    if isinstance(collider, Sphere):
+        offsets = positions - _vector(collider.center, positions)
+        lengths = offsets.norm(dim=1)
+        is_centre = (lengths < 1e-12 * collider.radius)[:, None]
+        normals = torch.where(is_centre, _vector((0.0, 0.0, 1.0), positions), offsets / lengths.clamp(min=1e-300)[:, None])
+        return lengths - collider.radius, normals
+    found = collider.distances(positions.detach().cpu().numpy().astype(np.float64))
+    distances, normals = (torch.as_tensor(np.array(a), dtype=positions.dtype, device=positions.device) for a in found)
+    return distances + (normals * (positions - positions.detach())).sum(dim=1), normals

@@ -135,7 +135,7 @@ def correct(positions, starts, indices, rest_density, lambdas, moving, factors, 
             inverse = 1.0 / math.sqrt(squared)
             slope = max(1.0 - squared * inverse, 0.0)
             over = -scale * slope * slope * inverse * min(limit, factors[j])
-            pressure = over * (own + lambdas[j] - tensile * _tensile_share(squared, exponent))
+            pressure = over * (own + lambdas[j] - tensile * tensile_share(squared, exponent))
             impulse = over * (own_moving + moving[j])
             sx += pressure * dx
             sy += pressure * dy
@@ -148,7 +148,7 @@ def correct(positions, starts, indices, rest_density, lambdas, moving, factors, 
 
 
 @njit(cache=True, inline="always")
-def _tensile_share(squared, exponent):
+def tensile_share(squared, exponent):
     """(W(r) / W(0.25 h))^exponent by the bits of the exponent: selects, not branches."""
     base = max(1.0 - squared, 0.0) / (1.0 - 0.25 * 0.25)
     one = base * base * base

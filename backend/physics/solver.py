@@ -96,6 +96,7 @@ class Solver:
         self.squares_at_rest = SPIKY_SQUARED_GRADIENT / rest_density  # of the constraint's gradients
         self.densities, self.lambdas, self.shares = np.zeros(num), np.zeros(num), np.zeros(num)
         self.shifts, self.impulses = np.zeros((num, 3)), np.zeros((num, 3))
+        self.factors, self.scale = np.ones(num), RELAXATION  # by which the last correction was limited, each and all
         self.overdensity = 0.0
         self.list_builds = 0
         self._listed: np.ndarray | None = None  # positions when the lists were made
@@ -151,14 +152,14 @@ class Solver:
             if largest <= MAX_SHIFT or attempt == 1:
                 break
             factors = MAX_SHIFT / np.maximum(lengths, MAX_SHIFT)
-        scale = RELAXATION * min(1.0, MAX_SHIFT / max(largest, 1e-300))
-        self.shifts *= scale
-        self.impulses *= scale
+        self.factors, self.scale = factors, RELAXATION * min(1.0, MAX_SHIFT / max(largest, 1e-300))
+        self.shifts *= self.scale
+        self.impulses *= self.scale
 
     def advance(self, motion: np.ndarray, parameters: FluidParameters, seconds: float) -> np.ndarray:
         """One substep from a motion that holds the forces. Returns the motion after it."""
         length, colliders = parameters.smoothing_length, parameters.colliders
-        self.positions = _pushed_out(self.positions + motion, colliders, length)
+        self.positions = pushed_out(self.positions + motion, colliders, length)
         total = np.zeros_like(motion)
         rates = self.rates(motion)
         for iteration in range(parameters.solver_iterations):
@@ -169,14 +170,14 @@ class Solver:
                 self.shares = caused_share(rates, excess)
             self.correct(parameters)
             total += self.impulses
-            self.positions = _pushed_out(self.positions + self.shifts, colliders, length)
+            self.positions = pushed_out(self.positions + self.shifts, colliders, length)
         motion = motion + energy_share(motion, total) * total
-        motion = self._stirred(motion, parameters, seconds)
+        motion = self.stirred(motion, parameters, seconds)
         if colliders:
             motion = deflect(motion, self.positions * length, colliders, margin=1e-6 * length)
         return motion
 
-    def _stirred(self, motion: np.ndarray, parameters: FluidParameters, seconds: float) -> np.ndarray:
+    def stirred(self, motion: np.ndarray, parameters: FluidParameters, seconds: float) -> np.ndarray:
         """Drag at the surface, viscosity and vorticity confinement, where wanted."""
         if max(parameters.surface_drag, parameters.viscosity, parameters.vorticity_confinement) == 0.0:
             return motion
@@ -199,6 +200,6 @@ class Solver:
         return motion
 
 
-def _pushed_out(positions: np.ndarray, colliders: Sequence[Collider], length: float) -> np.ndarray:
+def pushed_out(positions: np.ndarray, colliders: Sequence[Collider], length: float) -> np.ndarray:
     """Positions [N, 3] in smoothing lengths, outside the colliders, which are in metres."""
     return push_out(positions * length, colliders) / length if colliders else positions
