@@ -13,7 +13,7 @@ from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.geometry.camera import View
 
 MARGIN = 0.15  # share of the image around it in which particles live on unseen
-PER_PARTICLE = {"positions", "velocities", "masses", "optical_masses", "scales", "colors", "ids", "born"}
+PER_PARTICLE = {"positions", "velocities", "masses", "optical_masses", "scales", "rotations", "colors", "ids", "born"}
 
 AnyRecord = TypeVar("AnyRecord", PhysicalRecord, VisualRecord)
 
@@ -39,20 +39,24 @@ def is_near_image(positions: np.ndarray, view: View) -> np.ndarray:
 
 def take(record: AnyRecord, is_kept: np.ndarray) -> AnyRecord:
     """The record with some of its particles."""
-    names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
-    return dataclasses.replace(record, **{name: getattr(record, name)[is_kept] for name in names})
+    return dataclasses.replace(record, **{name: getattr(record, name)[is_kept] for name in _names(record)})
 
 
 def join(record: AnyRecord, **newborn: np.ndarray) -> AnyRecord:
     """The record with newborn particles behind its own; ids and next_id are given here."""
     count = len(newborn["positions"])
     newborn["ids"] = record.next_id + np.arange(count, dtype=np.int64)
-    names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
     joined = {}
-    for name in names:
+    for name in _names(record):
         old = getattr(record, name)
         joined[name] = np.concatenate([old, np.asarray(newborn[name]).astype(old.dtype)])
     return dataclasses.replace(record, **joined, next_id=np.asarray(record.next_id + count, np.int64))
+
+
+def _names(record: AnyRecord) -> set[str]:
+    """The arrays of a record that hold a row for each particle."""
+    names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
+    return {name for name in names if getattr(record, name) is not None}
 
 
 def buoyancy_of(record: PhysicalRecord) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

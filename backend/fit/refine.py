@@ -6,10 +6,11 @@ each position to where the flow carried it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from backend.fit.adam import Adam
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer
@@ -24,30 +25,16 @@ POSITION_PULL = 0.05  # strength of the pull to the carried position, in units o
 SCALE_RANGE = (0.6, 2.0)  # of the scale at birth
 
 
-@dataclass(slots=True)
-class _Adam:
-    """Kingma & Ba 2015, algorithm 1, for one array."""
-
-    step_size: float | np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    count: int = 0
-
-    @classmethod
-    def like(cls, array: np.ndarray, step_size: float | np.ndarray) -> _Adam:
-        return cls(step_size, np.zeros_like(array, np.float64), np.zeros_like(array, np.float64))
-
-    def change(self, gradient: np.ndarray) -> np.ndarray:
-        self.count += 1
-        self.first = 0.9 * self.first + 0.1 * gradient
-        self.second = 0.99 * self.second + 0.01 * gradient * gradient
-        mean = self.first / (1.0 - 0.9**self.count)
-        spread = np.sqrt(self.second / (1.0 - 0.99**self.count))
-        return -self.step_size * mean / (spread + 1e-12 + 1e-3 * float(spread.mean()))
-
-
 def as_gaussians(record: VisualRecord) -> Gaussians:
     """The record as the renderer knows it."""
+    if record.rotations is not None:
+        return Gaussians(
+            positions=record.positions,
+            scales=record.scales,
+            rotations=record.rotations,
+            optical_masses=record.optical_masses,
+            colors=record.colors,
+        )
     return isotropic(record.positions, record.scales, record.optical_masses, record.colors)
 
 
@@ -69,10 +56,10 @@ def refine(
     colors = record.colors.astype(np.float64)
     positions = carried.copy()
     adam = {
-        "positions": _Adam.like(positions, POSITION_STEP * reference_scale),
-        "scales": _Adam.like(scales, LOG_SCALE_STEP),
-        "masses": _Adam.like(log_masses, LOG_STEP),
-        "colors": _Adam.like(colors, COLOR_STEP),
+        "positions": Adam.like(positions, POSITION_STEP * reference_scale),
+        "scales": Adam.like(scales, LOG_SCALE_STEP),
+        "masses": Adam.like(log_masses, LOG_STEP),
+        "colors": Adam.like(colors, COLOR_STEP),
     }
     loss = 0.0
     for _ in range(iterations):

@@ -33,12 +33,13 @@ class VisualRecord:
 
     positions: np.ndarray  # [N, 3] float64 m
     velocities: np.ndarray  # [N, 3] float32 m/s
-    scales: np.ndarray  # [N] float32 m, standard deviation
+    scales: np.ndarray  # [N] float32 m, standard deviation; [N, 3] along the own axes where there are rotations
     optical_masses: np.ndarray  # [N] float32 m^2
     colors: np.ndarray  # [N, 3] float32 linear
     ids: np.ndarray  # [N] int64, never used twice
     born: np.ndarray  # [N] int32, frame
     next_id: np.ndarray  # [] int64
+    rotations: np.ndarray | None = None  # [N, 4] float32 unit quaternions w x y z, own axes -> world; None: all are round
 
 
 def particle_frame(record: VisualRecord) -> ParticleFrame:
@@ -50,4 +51,5 @@ def particle_frame(record: VisualRecord) -> ParticleFrame:
         optical_masses=record.optical_masses,
         colors=record.colors,
         ids=record.ids,
+        rotations=record.rotations,
     )

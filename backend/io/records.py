@@ -135,4 +135,6 @@ def open_stage_file(path: Path) -> h5py.File:
 
 
 def _arrays(record: Any) -> dict[str, np.ndarray]:
-    return {item.name: np.asarray(getattr(record, item.name)) for item in dataclasses.fields(record)}
+    """By name; what a record may lack and lacks is not written, and read as lacking."""
+    values = {item.name: getattr(record, item.name) for item in dataclasses.fields(record)}
+    return {name: np.asarray(value) for name, value in values.items() if value is not None}

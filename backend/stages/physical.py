@@ -11,29 +11,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from backend.contract.cameras import Cameras
 from backend.contract.job import PhysicalConfig
-from backend.fit import depth_prior, explain, image_motion
+from backend.fit import depth_prior, image_motion
 from backend.fit.carry import as_fluid
-from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
-from backend.fit.scene import Scene, make_scene, optical_depth
+from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord
+from backend.fit.supply import make_supply
 from backend.geometry.camera import View
 from backend.physics import fluid as fluids
 from backend.physics.buoyancy import solve_buoyancy
-from backend.physics.interpolate import interpolate_velocity, smooth
+from backend.physics.interpolate import smooth
 from backend.render import splat as renderer
-from backend.render.gaussians import isotropic
 from backend.reporting import Report
 
-SPLAT_SHARE = 0.5  # standard deviation of a physical particle's splat, share of the smoothing length
-DEATH_SHARE = 0.15  # of a particle's own share of the smoke: below it a particle is spent
-FADING = 0.7  # consistency of masses from frame to frame
-REST_QUANTILE = 0.95  # of the density of evenly sampled particles
 CONTAINMENT = 0.3  # share of what stands out of the prior's solid that is taken back a frame
 BUOYANCY_RIDGE = 20.0  # observations at which the learned buoyancy has half its say
 
@@ -65,39 +59,15 @@ class _Fit:
         self.scene = scene
         self.layers = layers
         self.config = config
-        self.seed = seed
-        masses = [frame_mass(scene, layers[frame], frame) for frame in range(len(layers))]
-        self.fullest = int(np.argmax(masses))
-        self.unit_mass = max(masses[self.fullest], 1e-30) / config.num_particles
-        view, tau = scene.views[self.fullest], optical_depth(layers[self.fullest])
-        prior = depth_prior.inflate(tau, view, scene.anchor)
-        solid = prior.half_thickness * prior.is_smoke
-        points, _ = depth_prior.sample_points(solid, config.num_particles, prior, view, seed=seed, is_even=True)
-        parameters = fluids.derive_parameters(
-            points, drag=config.drag, solver_iterations=config.solver_iterations, max_substeps=config.max_substeps
-        )
-        # Random points are denser here and sparser there; only what is denser than they were is pressed apart.
-        densest = float(np.quantile(fluids.number_density(points, parameters.smoothing_length), REST_QUANTILE))
-        self.parameters = replace(parameters, rest_density=max(parameters.rest_density, densest))
-        self.sigma = SPLAT_SHARE * self.parameters.smoothing_length
+        self.supply = make_supply(
+            scene, layers, config.num_particles, seed=seed,
+            drag=config.drag, solver_iterations=config.solver_iterations, max_substeps=config.max_substeps,
+        )  # fmt: skip
+        self.parameters = self.supply.parameters
 
     def start(self) -> PhysicalRecord:
         """Frame 0: the prior's points with the image's motion."""
-        empty = PhysicalRecord(
-            positions=np.zeros((0, 3)),
-            velocities=np.zeros((0, 3)),
-            masses=np.zeros(0),
-            ids=np.zeros(0, np.int64),
-            born=np.zeros(0, np.int32),
-            next_id=np.asarray(0, np.int64),
-            smoothing_length=np.asarray(self.parameters.smoothing_length),
-            rest_density=np.asarray(self.parameters.rest_density),
-            buoyancy=np.zeros(3),
-            buoyancy_weight=np.asarray(0.0),
-            buoyancy_moment=np.zeros(3),
-            buoyancy_square=np.zeros(3),
-        )
-        born = self._births(empty, 0)
+        born = self.supply.with_births(self.supply.empty(), 0)
         if len(self.layers) < 2 or len(born.positions) == 0:
             return born
         wanted, confidence = self._observed(born.positions, 0)
@@ -107,7 +77,7 @@ class _Fit:
     def advance(self, record: PhysicalRecord, frame: int) -> PhysicalRecord:
         """The record of `frame` from that of the frame before."""
         if len(record.positions) == 0:
-            return self._births(record, frame)
+            return self.supply.with_births(record, frame)
         dt = self.scene.seconds_per_frame
         parameters = replace(self.parameters, buoyancy=tuple(record.buoyancy))
         state, taken = fluids.step(as_fluid(record), parameters, dt)
@@ -117,16 +87,13 @@ class _Fit:
         lack = _sideways(record.positions + wanted - predicted, self.scene.views[frame])
         positions = predicted + self._smooth(gain * lack, record)
         moved = self._corrected(replace(record, positions=positions), frame)
-        moved = depth_prior.contain(moved, self._prior(frame), self.scene.views[frame], share=CONTAINMENT)
+        moved = depth_prior.contain(moved, self.supply.prior(frame), self.scene.views[frame], share=CONTAINMENT)
         velocities = (moved - record.positions) / dt
         learned = self._learn_buoyancy(record, velocities, confidence, taken.substeps)
         current = replace(learned, positions=moved, velocities=velocities)
-        return self._births(self._weighed(current, frame), frame)
+        return self.supply.with_births(self.supply.weighed(current, frame), frame)
 
     # -- parts of a step ------------------------------------------------------------------------------------------
-
-    def _prior(self, frame: int) -> depth_prior.DepthPrior:
-        return depth_prior.inflate(optical_depth(self.layers[frame]), self.scene.views[frame], self.scene.anchor)
 
     def _observed(self, positions: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement [N, 3] m that the image asks for from `frame` to the next, and its confidence [N]."""
@@ -135,21 +102,10 @@ class _Fit:
         views = (self.scene.views[frame], self.scene.views[frame + 1])
         return image_motion.lift_flow(flow, before[..., 3], positions, views)
 
-    def _splat(self, record: PhysicalRecord, frame: int) -> tuple[renderer.Splat, np.ndarray]:
-        """The particles' optical depth, and the frame's own, blurred to what particles of this size can show."""
-        view = self.scene.views[frame]
-        gaussians = isotropic(record.positions, np.full(len(record.positions), self.sigma), record.masses)
-        target = optical_depth(self.layers[frame])
-        distance = max(float(view.to_camera(self.scene.anchor[None])[0, 2]), 1e-6)
-        blur = self.sigma * view.fx / distance
-        if blur > 0.3:
-            target = cv2.GaussianBlur(target, (0, 0), min(blur, 0.25 * max(target.shape)))
-        return renderer.forward(gaussians, view), target
-
     def _corrected(self, record: PhysicalRecord, frame: int) -> np.ndarray:
         """Positions [N, 3] m after gradient steps on the squared error of the optical depth; each must lower it."""
         positions, reach = record.positions, 0.15 * self.parameters.smoothing_length
-        splat, target = self._splat(record, frame)
+        splat, target = self.supply.splat(record, frame)
         loss = float(np.square(splat.image[0] - target, dtype=np.float64).sum())
         for _ in range(self.config.correction_iterations):
             gradient = renderer.backward(splat, (splat.image - target[None]).astype(np.float32)).positions
@@ -158,7 +114,7 @@ class _Fit:
             if not largest > 0.0:
                 break
             tried = positions + direction * (reach / largest)
-            splat_tried, _ = self._splat(replace(record, positions=tried), frame)
+            splat_tried, _ = self.supply.splat(replace(record, positions=tried), frame)
             loss_tried = float(np.square(splat_tried.image[0] - target, dtype=np.float64).sum())
             if loss_tried < loss:
                 positions, splat, loss = tried, splat_tried, loss_tried
@@ -166,37 +122,6 @@ class _Fit:
             else:
                 reach *= 0.4
         return positions
-
-    def _weighed(self, record: PhysicalRecord, frame: int) -> PhysicalRecord:
-        """Masses after the frame was seen; the spent and the departed are dropped."""
-        splat, target = self._splat(record, frame)
-        _, masses = explain.fit_masses(splat, record.masses, target, iterations=2, consistency=FADING)
-        is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, self.scene.views[frame])
-        return take(replace(record, masses=masses.astype(np.float64)), is_kept)
-
-    def _births(self, record: PhysicalRecord, frame: int) -> PhysicalRecord:
-        """Particles for the smoke that nobody explains, each of one unit of mass."""
-        view = self.scene.views[frame]
-        splat, target = self._splat(record, frame)
-        missing = explain.missing_depth(splat, target)
-        missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
-        prior = self._prior(frame)
-        count = int((missing * pixel_mass(view, prior.center_depth)).sum() / self.unit_mass)
-        weight = missing if len(record.positions) else prior.half_thickness * (prior.is_smoke & (missing > 0.0))
-        points, _ = depth_prior.sample_points(weight, count, prior, view, seed=self.seed + 7919 * frame, is_even=True)
-        if len(points) == 0:
-            return record
-        velocities = np.zeros_like(points)
-        if len(record.positions):
-            state = as_fluid(record)
-            velocities = interpolate_velocity(points, state, self.parameters.smoothing_length)[0]
-        return join(
-            record,
-            positions=points,
-            velocities=velocities,
-            masses=np.full(len(points), self.unit_mass),
-            born=np.full(len(points), frame),
-        )
 
     def _learn_buoyancy(
         self, record: PhysicalRecord, velocities: np.ndarray, confidence: np.ndarray, substeps: int

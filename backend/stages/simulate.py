@@ -6,7 +6,6 @@ physical ones; at the source both are born again as they were during the fit.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -15,17 +14,16 @@ import numpy as np
 from backend.contract.errors import BackendError
 from backend.contract.job import PhysicalConfig
 from backend.fit.carry import as_fluid, carry, with_velocities
-from backend.fit.population import PER_PARTICLE, AnyRecord, join, take
+from backend.fit.population import take
+from backend.fit.replay import births_at_foot, born_again
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.physics import fluid as fluids
 from backend.reporting import Report
 
-FOOT = 0.2  # the source is the lowest fifth of the smoke's height
 SURFACE_DRAG = 3.0  # 1/s, where smoke borders on air: shears the edge of a plume
 VISCOSITY = 1.0  # 1/s
 VORTICITY_CONFINEMENT = 2.0  # 1/s
-REPLAYED = 24  # frames whose births the source repeats
 LIFETIME_REACH = 3.0  # heights of the smoke beyond which a particle is dropped
 
 
@@ -69,7 +67,7 @@ def run(
         vorticity_confinement=VORTICITY_CONFINEMENT,
         colliders=rollout.colliders,
     )
-    emitted = (_births(fluid), _births(seen))
+    emitted = (births_at_foot(fluid), births_at_foot(seen))
     low, high = look.positions.min(axis=0), look.positions.max(axis=0)
     reach = LIFETIME_REACH * float((high - low).max())
     for step in range(rollout.num_frames):
@@ -77,32 +75,10 @@ def run(
         state, _ = fluids.step(as_fluid(record), parameters, seconds)
         record = replace(record, positions=state.positions, velocities=state.velocities)
         look = carry(look, record, seconds=seconds)
-        record = _born_again(record, emitted[0], step)
-        look = _born_again(look, emitted[1], step)
+        record = born_again(record, emitted[0], step)
+        look = born_again(look, emitted[1], step)
         middle = 0.5 * (low + high)
         record = take(record, np.linalg.norm(record.positions - middle, axis=1) < reach)
         look = take(look, np.linalg.norm(look.positions - middle, axis=1) < reach)
         yield with_velocities(look, record)
     report.progress(rollout.num_frames, rollout.num_frames)
-
-
-def _births(records: Series[AnyRecord]) -> list[AnyRecord]:
-    """What was born at the foot of the smoke in each of the last frames of the fit."""
-    born = []
-    for frame in range(max(1, len(records) - REPLAYED), len(records)):
-        record = records[frame]
-        if len(record.positions) == 0:
-            continue
-        height = record.positions[:, 2]
-        is_at_foot = height <= height.min() + FOOT * (height.max() - height.min())
-        born.append(take(record, is_at_foot & (record.born == frame)))
-    return born
-
-
-def _born_again(record: AnyRecord, births: list[AnyRecord], step: int) -> AnyRecord:
-    """The record with the newborn of a fitted frame, one frame after the other, over and over."""
-    if not births:
-        return record
-    newborn = births[step % len(births)]
-    names = {item.name for item in dataclasses.fields(newborn)} & PER_PARTICLE - {"ids"}
-    return join(record, **{name: getattr(newborn, name) for name in names})
