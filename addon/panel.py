@@ -13,6 +13,7 @@ SECTIONS = (
     ("cameras", "Camera"),
     ("physical", "Motion"),
     ("visual", "Look"),
+    ("published", "Published Methods"),
     ("forecast", "Forecast"),
     ("export", "Volume"),
 )
@@ -121,6 +122,7 @@ class WILDSMOKE_PT_settings(_SidebarPanel, bpy.types.Panel):
             row = layout.row()
             row.label(text=f"{len(changed)} changed from {settings.preset.capitalize()}", icon="MODIFIER")
             row.operator("wildsmoke.reset_settings", text="", icon="LOOP_BACK")
+        layout.prop(settings.config, "method")
         layout.prop(settings.config, "seed")
 
 

@@ -193,15 +193,56 @@ class WILDSMOKE_PG_export(bpy.types.PropertyGroup):
     )
 
 
+class WILDSMOKE_PG_published(bpy.types.PropertyGroup):
+    """The published methods, where the method is one of them."""
+
+    num_physical: IntProperty(
+        name="Physical Particles", description="In the frame that shows most smoke", default=1500, min=8, max=1_000_000
+    )
+    num_particles: IntProperty(name="Particles", description="At most, in any frame", default=6000, min=8, max=10_000_000)
+    physical_iterations: IntProperty(
+        name="Physical Iterations", description="Optimiser steps in a frame, of the motion", default=12, min=0, max=10_000
+    )
+    visual_iterations: IntProperty(
+        name="Visual Iterations", description="Optimiser steps in a frame, of the look", default=12, min=0, max=10_000
+    )
+    first_frame_factor: IntProperty(
+        name="First Frame", description="Times as many iterations in the first frame", default=5, min=1, max=1000
+    )
+    solver_iterations: IntProperty(
+        name="Solver Iterations", description="Density projections in a substep", default=5, min=0, max=100
+    )
+    buoyancy: FloatProperty(
+        name="Buoyancy (m/s²)", description="Upwards; kept, or where learning starts", default=1.0, min=-1000.0, max=1000.0
+    )
+    surface_drag: FloatProperty(
+        name="Surface Drag (1/s)", description="Where smoke borders on air", default=3.0, min=0.0, max=1000.0
+    )
+    warm_up: IntProperty(
+        name="Warm-up", description="Iterations until the frequency loss counts in full", default=500, min=0, max=1_000_000_000
+    )
+
+
 class WILDSMOKE_PG_config(bpy.types.PropertyGroup):
     """A mirror of contract.Config."""
 
     seed: IntProperty(name="Seed", description="Of all random numbers", default=0, min=0, max=2**31 - 1)
+    method: EnumProperty(
+        name="Method",
+        description="How the particles are fitted and forecast",
+        items=(
+            ("default", "Default", "Wildsmoke's own"),
+            ("as_published", "As Published", "The losses and the fluid of WildSmoke as printed, from one view"),
+            ("fluidnexus", "FluidNexus", "The same without learned buoyancy and frequency loss"),
+        ),
+        default="default",
+    )
     frames: PointerProperty(type=WILDSMOKE_PG_frames)
     extraction: PointerProperty(type=WILDSMOKE_PG_extraction)
     cameras: PointerProperty(type=WILDSMOKE_PG_cameras)
     physical: PointerProperty(type=WILDSMOKE_PG_physical)
     visual: PointerProperty(type=WILDSMOKE_PG_visual)
+    published: PointerProperty(type=WILDSMOKE_PG_published)
     forecast: PointerProperty(type=WILDSMOKE_PG_forecast)
     export: PointerProperty(type=WILDSMOKE_PG_export)
 
@@ -328,6 +369,7 @@ CLASSES = (
     WILDSMOKE_PG_cameras,
     WILDSMOKE_PG_physical,
     WILDSMOKE_PG_visual,
+    WILDSMOKE_PG_published,
     WILDSMOKE_PG_forecast,
     WILDSMOKE_PG_export,
     WILDSMOKE_PG_config,

@@ -19,6 +19,7 @@ from .errors import BackendError
 from .units import JOB_FORMAT_VERSION
 
 PRESETS = ("draft", "preview", "final")
+METHODS = ("default", "as_published", "fluidnexus")
 DEVICES = ("auto", "cpu", "cuda")
 EXTRACTION_MODES = ("auto", "on_black", "alpha", "matte")
 CAMERA_MODES = ("auto", "still", "given")
@@ -144,6 +145,38 @@ class VisualConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PublishedConfig:
+    """The published methods, where `method` names one; the sections physical and visual then have no say.
+
+    num_physical: physical particles in the frame that shows most smoke. num_particles: Gaussians at most, in any frame.
+    physical_iterations, visual_iterations: optimiser steps a frame. first_frame_factor: times as many in the first one.
+    solver_iterations: density projections a substep. buoyancy: upwards, m/s^2; what is kept, or where learning starts.
+    surface_drag: where smoke borders on air, 1/s. warm_up: iterations until the frequency loss has its full weight.
+    """
+
+    num_physical: int = 1500
+    num_particles: int = 6000
+    physical_iterations: int = 12
+    visual_iterations: int = 12
+    first_frame_factor: int = 5
+    solver_iterations: int = 5
+    buoyancy: float = 1.0
+    surface_drag: float = 3.0
+    warm_up: int = 500
+
+    def __post_init__(self) -> None:
+        _check("num_physical", self.num_physical, 8, 1_000_000)
+        _check("num_particles", self.num_particles, 8, 10_000_000)
+        _check("physical_iterations", self.physical_iterations, 0, 10_000)
+        _check("visual_iterations", self.visual_iterations, 0, 10_000)
+        _check("first_frame_factor", self.first_frame_factor, 1, 1000)
+        _check("solver_iterations", self.solver_iterations, 0, 100)
+        _check("buoyancy", self.buoyancy, -1e3, 1e3)
+        _check("surface_drag", self.surface_drag, 0.0, 1e3)
+        _check("warm_up", self.warm_up, 0, 1_000_000_000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ForecastConfig:
     """The most likely next frames.
 
@@ -175,19 +208,22 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """Every setting. seed: of all random numbers."""
+    """Every setting. seed: of all random numbers. method: how physical and visual particles are fitted and forecast."""
 
     seed: int = 0
+    method: str = "default"
     frames: FramesConfig = field(default_factory=FramesConfig)
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     physical: PhysicalConfig = field(default_factory=PhysicalConfig)
     visual: VisualConfig = field(default_factory=VisualConfig)
+    published: PublishedConfig = field(default_factory=PublishedConfig)
     forecast: ForecastConfig = field(default_factory=ForecastConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
 
     def __post_init__(self) -> None:
         _check("seed", self.seed, 0, 2**31 - 1)
+        _check_choice("method", self.method, METHODS)
 
 
 def draft() -> Config:
@@ -196,6 +232,7 @@ def draft() -> Config:
         frames=FramesConfig(working_size=256),
         physical=PhysicalConfig(num_particles=1000, solver_iterations=2, correction_iterations=2),
         visual=VisualConfig(num_particles=4000, iterations=3, mass_iterations=6),
+        published=PublishedConfig(num_physical=1000, num_particles=4000, physical_iterations=6, visual_iterations=6),
         export=ExportConfig(max_voxels=128),
     )
 
@@ -211,6 +248,7 @@ def final() -> Config:
         frames=FramesConfig(working_size=480),
         physical=PhysicalConfig(num_particles=4000, solver_iterations=4, correction_iterations=8),
         visual=VisualConfig(num_particles=24000, iterations=16, mass_iterations=12),
+        published=PublishedConfig(num_physical=4000, num_particles=24000, physical_iterations=30, visual_iterations=30),
         export=ExportConfig(max_voxels=384),
     )
 

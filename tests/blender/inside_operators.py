@@ -158,9 +158,10 @@ def check_properties_mirror_the_contract(folder: Path) -> None:
         from wildsmoke.addon.settings import changed_settings
 
         mirror, config = bpy.context.scene.wildsmoke.config, contract.Config()
-        sections = [field.name for field in dataclasses.fields(config) if field.name != "seed"]
-        assert _own_names(mirror) == {*sections, "seed"}
-        _compare(mirror, config, {"seed"})
+        fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+        sections = [name for name, value in fields.items() if dataclasses.is_dataclass(value)]
+        assert _own_names(mirror) == set(fields)
+        _compare(mirror, config, fields.keys() - set(sections))
         for section in sections:
             group, values = getattr(mirror, section), getattr(config, section)
             names = {field.name for field in dataclasses.fields(values)}
@@ -203,7 +204,11 @@ def _compare(group: Any, values: Any, names: set[str]) -> None:
             assert prop.default == value, where
             for item in prop.enum_items:
                 dataclasses.replace(values, **{name: item.identifier})
-            choices = {"ExtractionConfig": contract.EXTRACTION_MODES, "CamerasConfig": contract.CAMERA_MODES}
+            choices = {
+                "Config": contract.METHODS,
+                "ExtractionConfig": contract.EXTRACTION_MODES,
+                "CamerasConfig": contract.CAMERA_MODES,
+            }
             assert tuple(prop.enum_items.keys()) == choices[type(values).__name__], where
         else:
             assert prop.type == {bool: "BOOLEAN", str: "STRING"}[type(value)] and prop.default == value, where
@@ -427,7 +432,7 @@ def check_every_panel_draws_in_every_phase(folder: Path) -> None:
 
         set_job(folder, "succeed")
         panels = [name for name in dir(bpy.types) if name.startswith("WILDSMOKE_PT_")]
-        assert len(panels) == 3 + len(dataclasses.fields(contract.Config())) - 1
+        assert len(panels) == 3 + len({key.partition(".")[0] for key in contract.settable_keys(contract.Config()) if "." in key})
         for phase in Phase:
             status = JobStatus(phase=phase, stage="visual", stage_count=3, message="What is wrong.", hint="What to do.")
             session.current.supervisor._statuses[folder / "job"] = status

@@ -14,7 +14,8 @@ from backend.contract import job as contract
 from backend.contract.errors import BackendError
 from backend.contract.job import Config, Job, checked_job, override, preset_config, read_job, settable_keys
 
-SECTIONS = [getattr(Config(), field.name) for field in dataclasses.fields(Config) if field.name != "seed"]
+PARTS = [getattr(Config(), field.name) for field in dataclasses.fields(Config)]
+SECTIONS = [part for part in PARTS if dataclasses.is_dataclass(part)]
 NUMBERS = [
     (type(section), field.name)
     for section in SECTIONS
