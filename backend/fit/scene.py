@@ -13,6 +13,10 @@ from backend.geometry.camera import View, view_at
 MAX_OPACITY = 0.99  # an 8-bit frame cannot tell more: beyond it optical depth is a guess
 MIN_PARALLAX = 0.02  # share of the mean squared sine between rays below which they do not meet anywhere in particular
 
+FOOT_HEIGHT = 0.05  # of the image
+FOOT_FAINT = 0.02  # of the fullest row: a row with less shows no foot
+FOOT_SHARE = 0.2  # of the most that the foot's rows ever show: in frames with less the source has gone out
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
@@ -50,28 +54,29 @@ def _standing_point(view: View) -> np.ndarray:
 
 
 def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.ndarray:
-    """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 32 frames.
+    """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 64 frames.
 
-    The foot (the lowest fifth of the smoke) is taken because a source stands still while the plume drifts.
+    The foot is what the lowest rows ever show, in the frames in which they show it: a source stands still, while all that
+    has left it drifts, and drift looks like depth to a camera that turns.
     """
-    normal, moment = np.zeros((3, 3)), np.zeros(3)
-    total = 0.0
-    for frame in np.unique(np.linspace(0, len(views) - 1, 32).astype(int)):
-        view, tau = views[frame], optical_depth(layers[frame])
-        weight = tau.sum(axis=1, dtype=np.float64)
-        if weight.sum() <= 0.0:
-            continue
-        below = np.cumsum(weight[::-1])[::-1]  # smoke at and below each row
-        foot = np.where((below <= 0.2 * below[0])[:, None], tau, 0.0).astype(np.float64)
-        if foot.sum() <= 0.0:
-            continue
-        rows, columns = np.mgrid[0 : tau.shape[0], 0 : tau.shape[1]]
-        pixel = np.array([(foot * columns).sum(), (foot * rows).sum()]) / foot.sum() + 0.5
+    frames = np.unique(np.linspace(0, len(views) - 1, 64).astype(int))
+    in_row = np.stack([optical_depth(layers[frame]).sum(axis=1, dtype=np.float64) for frame in frames])  # [F, H]
+    shown = np.flatnonzero(in_row.max(axis=0) > FOOT_FAINT * in_row.max())
+    if shown.size == 0:
+        return _standing_point(views[0])
+    height = max(1, round(FOOT_HEIGHT * in_row.shape[1]))
+    rows = slice(max(0, int(shown[-1]) - height + 1), int(shown[-1]) + 1)
+    in_foot = in_row[:, rows].sum(axis=1)
+    normal, moment, total = np.zeros((3, 3)), np.zeros(3), 0.0
+    for frame in frames[in_foot > FOOT_SHARE * in_foot.max()]:
+        view, foot = views[frame], optical_depth(layers[frame])[rows].astype(np.float64)
+        row, column = np.mgrid[rows, 0 : foot.shape[1]]
+        pixel = np.array([(foot * column).sum(), (foot * row).sum()]) / foot.sum() + 0.5
         ray = view.unproject(pixel[None], np.ones(1))[0] - view.position
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         moment += across @ view.position
         total += 1.0
-    if total == 0.0 or np.linalg.eigvalsh(normal)[0] < MIN_PARALLAX * total:
+    if np.linalg.eigvalsh(normal)[0] < MIN_PARALLAX * total:
         return _standing_point(views[0])
     return np.linalg.solve(normal, moment)
