@@ -218,6 +218,9 @@ class WILDSMOKE_PG_published(bpy.types.PropertyGroup):
     surface_drag: FloatProperty(
         name="Surface Drag (1/s)", description="Where smoke borders on air", default=3.0, min=0.0, max=1000.0
     )
+    viscosity: FloatProperty(
+        name="Viscosity (1/s)", description="How fast neighbours' velocities become equal", default=3.0, min=0.0, max=1000.0
+    )
     warm_up: IntProperty(
         name="Warm-up", description="Iterations until the frequency loss counts in full", default=500, min=0, max=1_000_000_000
     )

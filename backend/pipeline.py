@@ -161,7 +161,9 @@ class Pipeline:
         return mark
 
     def _physical(self, smoke_mark: str, cameras_mark: str) -> str:
-        mark = fingerprint("physical", self.config.physical, str(self.config.seed), smoke_mark, cameras_mark)
+        mark = fingerprint(
+            "physical", self.config.physical, str(self.config.seed), smoke_mark, cameras_mark, *self._method_marks()
+        )
 
         def write(report: StageReport) -> None:
             with open_stage_file(self.folder.smoke) as file:
@@ -169,7 +171,7 @@ class Pipeline:
                 parts = RecordFolder(self.folder.physical.with_suffix(".parts"), mark, PhysicalRecord)
                 records = physical.run(
                     layers, read_cameras(self.folder.cameras), self.config.physical, report,
-                    seed=self.config.seed, done=parts,
+                    seed=self.config.seed, done=parts, method=self.config.method, published=self.config.published,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.physical, mark, parts)
@@ -179,7 +181,8 @@ class Pipeline:
         return mark
 
     def _visual(self, smoke_mark: str, cameras_mark: str, physical_mark: str) -> str:
-        mark = fingerprint("visual", self.config.visual, str(self.config.seed), smoke_mark, cameras_mark, physical_mark)
+        inputs = (smoke_mark, cameras_mark, physical_mark, *self._method_marks())
+        mark = fingerprint("visual", self.config.visual, str(self.config.seed), *inputs)
 
         def write(report: StageReport) -> None:
             with open_stage_file(self.folder.smoke) as file, RecordFile(self.folder.physical, PhysicalRecord) as fluid:
@@ -187,7 +190,7 @@ class Pipeline:
                 parts = RecordFolder(self.folder.visual.with_suffix(".parts"), mark, VisualRecord)
                 records = visual.run(
                     layers, read_cameras(self.folder.cameras), fluid, self.config.visual, report,
-                    seed=self.config.seed, done=parts,
+                    seed=self.config.seed, done=parts, method=self.config.method, published=self.config.published,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.visual, mark, parts)
@@ -210,8 +213,8 @@ class Pipeline:
             ):
                 layers = FrameStack(file, "smoke")
                 records = forecast.run(
-                    layers, read_cameras(self.folder.cameras), fluid[len(fluid) - 1], seen[len(seen) - 1], config, report,
-                    seed=self.config.seed,
+                    layers, read_cameras(self.folder.cameras), fluid, seen, config, report,
+                    seed=self.config.seed, method=self.config.method, published=self.config.published,
                 )  # fmt: skip
                 write_records(self.folder.forecast, mark, records)
 
@@ -265,7 +268,7 @@ class Pipeline:
                 fluid={
                     "smoothing_length_m": float(last.smoothing_length),
                     "rest_density": float(last.rest_density),
-                    "drag_per_second": self.config.physical.drag,
+                    **self._drag(),
                 },
                 provenance={
                     "program": f"wildsmoke {__version__}",
@@ -307,7 +310,19 @@ class Pipeline:
             fingerprint=mark,
         )
 
+    def _drag(self) -> dict[str, float]:
+        """The drag of the method's fluid, 1/s: everywhere, or where smoke borders on air."""
+        if self.config.method == "default":
+            return {"drag_per_second": self.config.physical.drag}
+        return {"surface_drag_per_second": self.config.published.surface_drag}
+
     # -- bookkeeping ----------------------------------------------------------------------------------------------
+
+    def _method_marks(self) -> tuple[str, ...]:
+        """What the particles follow from besides; nothing for the default, whose files stay valid."""
+        if self.config.method == "default":
+            return ()
+        return (self.config.method, json.dumps(asdict(self.config.published), sort_keys=True))
 
     def _stage(self, name: str, mark: str, found: str | None, write: Callable[[StageReport], None]) -> None:
         """Announce a stage, and do it unless its file is there. A stage that is done anew ends the old result."""

@@ -151,7 +151,8 @@ class PublishedConfig:
     num_physical: physical particles in the frame that shows most smoke. num_particles: Gaussians at most, in any frame.
     physical_iterations, visual_iterations: optimiser steps a frame. first_frame_factor: times as many in the first one.
     solver_iterations: density projections a substep. buoyancy: upwards, m/s^2; what is kept, or where learning starts.
-    surface_drag: where smoke borders on air, 1/s. warm_up: iterations until the frequency loss has its full weight.
+    surface_drag: where smoke borders on air, 1/s. viscosity: how fast neighbours' velocities become equal, 1/s.
+    warm_up: iterations until the frequency loss has its full weight.
     """
 
     num_physical: int = 1500
@@ -162,6 +163,7 @@ class PublishedConfig:
     solver_iterations: int = 5
     buoyancy: float = 1.0
     surface_drag: float = 3.0
+    viscosity: float = 3.0
     warm_up: int = 500
 
     def __post_init__(self) -> None:
@@ -173,6 +175,7 @@ class PublishedConfig:
         _check("solver_iterations", self.solver_iterations, 0, 100)
         _check("buoyancy", self.buoyancy, -1e3, 1e3)
         _check("surface_drag", self.surface_drag, 0.0, 1e3)
+        _check("viscosity", self.viscosity, 0.0, 1e3)
         _check("warm_up", self.warm_up, 0, 1_000_000_000)
 
 

@@ -72,7 +72,7 @@ class Appearance:
         record = self._calmed(record, layer, view, depth_prior.inflate(target, view, self.scene.anchor))
         kept = config.consistency if consistency is None else consistency
         record = self._weighed(record, frame, target, consistency=kept)
-        record = self._births(record, frame, target)
+        record = self.with_births(record, frame, target)
         record = self._weighed(record, frame, target, consistency=0.0)
         if config.iterations == 0:
             return record, 0.0
@@ -125,7 +125,7 @@ class Appearance:
         is_kept[order[is_faint]] = False
         return take(record, is_kept)
 
-    def _births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
+    def with_births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
         """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
         view, layer = self.scene.views[frame], self.layers[frame]
         splat = renderer.forward(as_gaussians(record), view)
@@ -145,12 +145,14 @@ class Appearance:
         seen = layer[rows, columns]
         colors = seen[:, :3] / np.maximum(seen[:, 3:], 0.02)
         count = len(points)
-        return join(
-            record,
-            positions=points,
-            velocities=np.zeros((count, 3)),
-            scales=np.full(count, self.scale),
-            optical_masses=np.full(count, total / count),
-            colors=colors,
-            born=np.full(count, frame),
-        )
+        newborn = {
+            "positions": points,
+            "velocities": np.zeros((count, 3)),
+            "scales": np.full((count, *record.scales.shape[1:]), self.scale),
+            "optical_masses": np.full(count, total / count),
+            "colors": colors,
+            "born": np.full(count, frame),
+        }
+        if record.rotations is not None:
+            newborn["rotations"] = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        return join(record, **newborn)

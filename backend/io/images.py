@@ -30,6 +30,11 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
 
+def linear_to_srgb_slope(linear: np.ndarray) -> np.ndarray:
+    """Derivative of linear_to_srgb."""
+    return np.where(linear <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1.0 / 2.4 - 1.0))
+
+
 _TABLE_8 = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 _TABLE_16 = srgb_to_linear(np.arange(65536) / 65535.0).astype(np.float32)
 

@@ -24,6 +24,8 @@ import numpy as np
 from .emission import joined
 from .fluid import step_with
 from .fluid_tape import RecordingSolver, Substep
+from .gradient_kernels import density_gradient
+from .neighbours import find_neighbours
 from .state import FluidParameters, FluidState, StepReport
 from .substep_gradient import AirGradients, no_air_gradients, substep_gradient
 from .threads import threads_for
@@ -148,6 +150,20 @@ def rollout(
         reports.append(report)
         steps.append(_Step(order=order, velocities=before.velocities, tape=tuple(solver.tape), num_born=num_born))
     return Rollout(states=tuple(states), reports=tuple(reports), parameters=parameters, seconds=seconds, steps=tuple(steps))
+
+
+def number_density_gradient(
+    positions: np.ndarray,  # [N, 3] m
+    smoothing_length: float,  # m
+    density_gradients: np.ndarray,  # [N], by fluid.number_density, per 1/m^3
+) -> np.ndarray:  # [N, 3], by the positions
+    """Vector-Jacobian product of fluid.number_density."""
+    gradients = np.zeros((len(positions), 3))
+    scaled = np.ascontiguousarray(positions / smoothing_length)
+    with threads_for(len(positions)):
+        lists = find_neighbours(scaled, 1.0)
+        density_gradient(scaled, lists.starts, lists.indices, density_gradients / smoothing_length**3, gradients)
+    return gradients / smoothing_length
 
 
 def _step_gradient(

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from backend.contract.cameras import Cameras
-from backend.contract.job import PhysicalConfig
+from backend.contract.job import PhysicalConfig, PublishedConfig
 from backend.fit import depth_prior, image_motion
 from backend.fit.carry import as_fluid
 from backend.fit.scene import Scene, make_scene
@@ -25,6 +25,7 @@ from backend.geometry.camera import View
 from backend.physics import fluid as fluids
 from backend.physics.buoyancy import solve_buoyancy
 from backend.physics.interpolate import smooth
+from backend.published import physical as published_physical
 from backend.render import splat as renderer
 from backend.reporting import Report
 
@@ -40,8 +41,14 @@ def run(
     *,
     seed: int,
     done: Series[PhysicalRecord],
+    method: str = "default",
+    published: PublishedConfig | None = None,  # the settings of the other methods
 ) -> Iterator[PhysicalRecord]:
     """Yields the records of the frames behind those that are `done`."""
+    if method != "default":
+        settings, learns = published or PublishedConfig(), method == "as_published"
+        yield from published_physical.run(layers, cameras, settings, report, learns_buoyancy=learns, seed=seed, done=done)
+        return
     fit = _Fit(make_scene(layers, cameras), layers, config, seed)
     first = len(done)
     record = done[first - 1] if first else None

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from backend.contract.cameras import Cameras
-from backend.contract.job import VisualConfig
+from backend.contract.job import PublishedConfig, VisualConfig
 from backend.fit.appearance import Appearance
 from backend.fit.carry import carry, with_velocities
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.published import visual as published_visual
 from backend.reporting import Report
 
 
@@ -25,8 +26,16 @@ def run(
     *,
     seed: int,
     done: Series[VisualRecord],
+    method: str = "default",
+    published: PublishedConfig | None = None,  # the settings of the other methods
 ) -> Iterator[VisualRecord]:
     """Yields the records of the frames behind those that are `done`."""
+    if method != "default":
+        settings, has_frequency_loss = published or PublishedConfig(), method == "as_published"
+        yield from published_visual.run(
+            layers, cameras, fluid, settings, report, has_frequency_loss=has_frequency_loss, seed=seed, done=done
+        )
+        return
     scene = make_scene(layers, cameras)
     appearance = Appearance(scene, layers, config, seed)
     first = len(done)
