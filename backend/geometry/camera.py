@@ -5,7 +5,7 @@ Camera axes x right, y down, z forward (OpenCV); world right-handed, z up; pixel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,14 +56,20 @@ class View:
 
 def view_at(cameras: Cameras, frame: int, *, size: tuple[int, int] | None = None) -> View:
     """The camera of a frame, with its intrinsics scaled to an image of `size` (width, height)."""
-    width, height = size or (cameras.width, cameras.height)
-    sx, sy = width / cameras.width, height / cameras.height
-    return View(
-        width=width,
-        height=height,
-        fx=cameras.fx * sx,
-        fy=cameras.fy * sy,
-        cx=cameras.cx * sx,
-        cy=cameras.cy * sy,
+    view = View(
+        width=cameras.width,
+        height=cameras.height,
+        fx=cameras.fx,
+        fy=cameras.fy,
+        cx=cameras.cx,
+        cy=cameras.cy,
         camera_to_world=np.array(cameras.at(frame), np.float64),
     )
+    return view if size is None else resized(view, size)
+
+
+def resized(view: View, size: tuple[int, int]) -> View:
+    """The same view in an image of another size (width, height)."""
+    width, height = size
+    sx, sy = width / view.width, height / view.height
+    return replace(view, width=width, height=height, fx=view.fx * sx, fy=view.fy * sy, cx=view.cx * sx, cy=view.cy * sy)
