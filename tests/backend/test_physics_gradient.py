@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from backend.physics import colliders
-from backend.physics.fluid import FluidParameters, FluidState, derive_parameters, step
-from backend.physics.fluid_gradient import rollout
+from backend.physics.fluid import FluidParameters, FluidState, derive_parameters, number_density, step
+from backend.physics.fluid_gradient import number_density_gradient, rollout
 from backend.physics.fluid_torch import Air, step_torch
 
 DT = 0.05
@@ -268,6 +268,20 @@ def test_scale_free():
         moved = rollout(state, parameters, DT, num_steps=1)
         found.append(moved.backward(random_gradients(moved.states)[0]).start.positions)
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
+
+
+def test_number_density_by_differences():
+    state, length = cloud(60, squeeze=0.5), parameters_of().smoothing_length
+    random = np.random.default_rng(7)
+    bars, along = random.normal(size=60), random.normal(size=(60, 3))
+
+    def total(share):
+        return float(number_density(state.positions + share * along, length) @ bars)
+
+    measured = (total(1e-6) - total(-1e-6)) / 2e-6
+    found = number_density_gradient(state.positions, length, bars)
+    assert measured == pytest.approx(float((found * along).sum()), rel=1e-6)
+    assert number_density_gradient(np.zeros((0, 3)), length, np.zeros(0)).shape == (0, 3)
 
 
 def test_memory_is_told():
