@@ -16,7 +16,7 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[2]
 BLENDER = frozenset(("bpy", "bpy_extras", "bmesh", "mathutils", "gpu", "blf", "addon_utils", "bl_ui", "openvdb"))
 IMPORTERS = ("importlib.import_module", "import_module", "__import__")
-OURS = frozenset(("addon", "backend", "synthetic", "tools", "benchmarks", "tests", "wildsmoke"))
+OURS = frozenset(("addon", "backend", "synthetic", "training", "tools", "benchmarks", "tests", "wildsmoke"))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def backend_problem(found: Import) -> str | None:
     """The backend: never Blender, never the other houses; its parts keep their distance."""
     if found.top in BLENDER - {"openvdb"}:
         return "the backend never imports Blender"
-    if found.is_of("addon", "synthetic", "tools", "benchmarks", "tests", "wildsmoke"):
+    if found.is_of("addon", "synthetic", "training", "tools", "benchmarks", "tests", "wildsmoke"):
         return "the backend stands alone"
     where = found.file
     if where.startswith("backend/contract/"):
@@ -92,6 +92,8 @@ def backend_problem(found: Import) -> str | None:
         return "physics never imports render"
     if where.startswith("backend/render/") and found.is_of("backend.physics"):
         return "render never imports physics"
+    if where.startswith(("backend/field/", "backend/prior/")) and found.is_of("backend.fit", "backend.render", "backend.physics"):
+        return "grids know nothing of particles"
     if found.is_of("backend.published") and not where.startswith(("backend/stages/", "backend/published/")):
         return "only the stages choose a method"
     parts = ("backend/physics/", "backend/render/", "backend/geometry/", "backend/fit/", "backend/published/")
@@ -104,7 +106,7 @@ def backend_problem(found: Import) -> str | None:
 
 def synthetic_problem(found: Import) -> str | None:
     """The truth is made without the code under test."""
-    if found.is_of("backend.render", "backend.physics", "backend.fit", "backend.stages"):
+    if found.is_of("backend.render", "backend.physics", "backend.fit", "backend.prior", "backend.stages", "training"):
         return "truth made by the code under test proves nothing"
     return None
 
@@ -163,6 +165,9 @@ def problem_of(source: str, file: str) -> str | None:
         ("from backend.published import visual", "backend/fit/scene.py"),
         ("from backend.stages import visual", "backend/published/visual.py"),
         ("from backend.pipeline import Pipeline", "backend/fit/scene.py"),
+        ("from training import train", "backend/prior/network.py"),
+        ("from backend.fit import scene", "backend/prior/window.py"),
+        ("from backend.prior import network", "synthetic/solver/simulation.py"),
         ("from backend.render import splat", "synthetic/render.py"),
         ("from ..backend import physics", "synthetic/render.py"),
     ],

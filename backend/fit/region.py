@@ -1,0 +1,75 @@
+"""The part of the world that the smoke of a clip fills, and the clip's optical depth at the size in which the prior sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from backend.fit.scene import Scene, optical_depth
+from backend.fit.series import Series
+from backend.geometry.camera import View, resized
+
+CELLS_HIGH, CELLS_WIDE = 37.0, 22.0  # voxels that the smoke of the clip should fill at most
+PIXELS_A_CELL = 1.85
+_FAINT = 0.03  # of the largest optical depth: where the smoke of a frame ends
+_PULL = 0.5  # of a frame: how strongly the middle is drawn to the source where the views do not tell
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """centre [3] m: the middle of the smoke; source [3] m; voxel_size m; depths [F, h, w] float32: small optical depths;
+    views: of the small images."""
+
+    centre: np.ndarray
+    source: np.ndarray
+    voxel_size: float
+    depths: np.ndarray
+    views: tuple[View, ...]
+
+
+def find_region(layers: Series[np.ndarray], scene: Scene) -> Region | None:
+    """Where the smoke of all frames together is, at the distance of its source; None where no frame shows any."""
+    boxes = [_box(optical_depth(layers[frame])) for frame in range(len(layers))]
+    seen = [frame for frame, box in enumerate(boxes) if box is not None]
+    if not seen:
+        return None
+    heights, widths = [], []
+    normal, moment = _PULL * np.eye(2), _PULL * scene.anchor[:2]
+    for frame in seen:
+        view, (top, bottom, left, right, middle) = scene.views[frame], boxes[frame]  # type: ignore[misc]
+        distance = np.full(3, max(float(view.to_camera(scene.anchor[None])[0, 2]), 1e-6))
+        corners = view.unproject(np.array([[view.cx, top], [view.cx, bottom], [middle, view.cy]]), distance)
+        heights += [corners[0, 2], corners[1, 2]]
+        widths.append((right - left) / view.fx * distance[0])
+        across = np.array([view.camera_to_world[0, 0], view.camera_to_world[1, 0]])
+        across = across / max(float(np.linalg.norm(across)), 1e-9)
+        normal += np.outer(across, across)
+        moment += across * (across @ corners[2, :2])
+    centre = np.array([*np.linalg.solve(normal, moment), 0.5 * (min(heights) + max(heights))])
+    voxel_size = max((max(heights) - min(heights)) / CELLS_HIGH, float(np.quantile(widths, 0.9)) / CELLS_WIDE)
+    view = scene.views[seen[0]]
+    pixel = max(float(view.to_camera(scene.anchor[None])[0, 2]), 1e-6) / view.fx
+    share = min(1.0, PIXELS_A_CELL * pixel / voxel_size)
+    size = max(4, round(view.width * share)), max(4, round(view.height * share))
+    small = [cv2.resize(optical_depth(layers[frame]), size, interpolation=cv2.INTER_AREA) for frame in range(len(layers))]
+    return Region(
+        centre=centre,
+        source=scene.anchor,
+        voxel_size=voxel_size,
+        depths=np.stack(small),
+        views=tuple(resized(item, size) for item in scene.views),
+    )
+
+
+def _box(depth: np.ndarray) -> tuple[float, float, float, float, float] | None:
+    """[H, W] -> first and last row and column of smoke, and the column of its middle, px; None without smoke."""
+    largest = float(depth.max(initial=0.0))
+    if largest < 0.01:
+        return None
+    is_smoke = depth > _FAINT * largest
+    rows, columns = np.flatnonzero(is_smoke.any(axis=1)), np.flatnonzero(is_smoke.any(axis=0))
+    in_column = depth.sum(axis=0, dtype=np.float64)
+    middle = float((in_column * np.arange(len(in_column))).sum() / in_column.sum()) + 0.5
+    return float(rows[0]), float(rows[-1]) + 1.0, float(columns[0]), float(columns[-1]) + 1.0, middle

@@ -1,0 +1,1 @@
+"""What simulated plumes teach about smoke that one camera does not see: a network that proposes density and velocity."""

@@ -1,0 +1,104 @@
+"""The network at work: for each frame of a clip a proposal of density and velocity, on the grid before its camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from backend.geometry.camera import View
+from backend.geometry.lattice import Lattice
+from backend.prior.network import PlumeNet, Sight
+from backend.prior.window import Stand, look, stand_before
+
+WEIGHTS = Path(__file__).resolve().parent / "plumes.npz"
+SHAPE = (24, 24, 40)
+CELLS_IN_SIGHT = 43.0  # voxels from the lower to the upper edge of the picture, at the smoke's distance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """density [X, Y, Z] 1/m and velocity [X, Y, Z, 3] m/s along the world's axes, on the voxels of `stand`."""
+
+    stand: Stand
+    density: np.ndarray
+    velocity: np.ndarray
+
+    def density_on(self, lattice: Lattice) -> np.ndarray:
+        """[X, Y, Z] 1/m on voxels of the world; zero beyond the grid."""
+        return ndimage.map_coordinates(self.density, self._places(lattice), order=1, mode="constant").astype(np.float32)
+
+    def velocity_on(self, lattice: Lattice) -> np.ndarray:
+        """[X, Y, Z, 3] m/s on voxels of the world; that of the nearest voxel beyond the grid."""
+        at = self._places(lattice)
+        found = [ndimage.map_coordinates(self.velocity[..., axis], at, order=1, mode="nearest") for axis in range(3)]
+        return np.stack(found, axis=-1).astype(np.float32)
+
+    def _places(self, lattice: Lattice) -> np.ndarray:
+        return np.moveaxis(self.stand.voxels(lattice.centres()), -1, 0)
+
+
+class Prior:
+    """The trained network. Raises FileNotFoundError without its weights."""
+
+    def __init__(self, weights: Path = WEIGHTS) -> None:
+        with np.load(weights) as arrays:
+            widths = tuple(int(width) for width in arrays["widths"])
+            state = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
+        self.net = PlumeNet(widths)
+        self.net.load_state_dict(state)
+        self.net.eval()
+
+    def propose(
+        self,
+        depth_at: Callable[[int], np.ndarray],
+        view_at: Callable[[int], View],
+        centre: np.ndarray,
+        source: np.ndarray,
+        frame: int,
+        *,
+        voxel_size: float,
+        stride: int,
+        num_frames: int,
+        seconds_per_frame: float,
+    ) -> Proposal:
+        """depth_at: frame -> optical depth [h, w] with pixels of about half a voxel; view_at: frame -> its view.
+
+        centre [3] m: of the grid; source [3] m: what the smoke rises from.
+        """
+        stand = stand_before(view_at(frame), centre, voxel_size=voxel_size, shape=SHAPE)
+        window = look(depth_at, view_at, stand, source, frame, stride=stride, num_frames=num_frames)
+        with torch.no_grad(), _one_thread():
+            names = ("images", "matrices", "strides", "conditions", "source")
+            sight = Sight(**{name: torch.from_numpy(getattr(window, name))[None] for name in names})
+            density, velocity = self.net(sight, SHAPE)[1]
+        to_world = stand.from_world[:3, :3]
+        speed = voxel_size / (stride * seconds_per_frame)
+        return Proposal(
+            stand=stand,
+            density=density[0].numpy() * (window.scale / voxel_size),
+            velocity=(np.moveaxis(velocity[0].numpy(), 0, -1) @ to_world * speed).astype(np.float32),
+        )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums of the network are split by the number of threads: with one, the bytes are the same everywhere."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def save_weights(net: PlumeNet, file: BinaryIO) -> None:
+    """As float16: half the size, and no figure changes."""
+    arrays = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()}
+    np.savez_compressed(file, widths=np.array(net.widths), **arrays)  # type: ignore[arg-type]

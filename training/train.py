@@ -1,0 +1,152 @@
+"""Train the prior on lessons. Goes on where it was interrupted; every tenth plume is held back and scored.
+
+    .venv/backend/bin/python -m training.train --lessons DIR --out DIR [--passes 20]
+
+OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass; OUT/plumes.npz: the weights as they ship.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from backend.io.atomic import whole_file
+from backend.prior.network import PlumeNet, Sight
+from backend.prior.predict import save_weights
+from backend.prior.window import NUM_CONDITIONS, OFFSETS
+from training.samples import SHAPE
+
+_HELD_BACK = 10  # every such plume
+_USUAL_SPEED = 0.5  # voxels a stride
+_BATCH = 8
+
+
+class Lessons:
+    """All lessons in memory; a batch as float32."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        parts = [np.load(path) for path in paths]
+        self.arrays = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0].files}
+
+    def __len__(self) -> int:
+        return len(self.arrays["density"])
+
+    def batch(self, indices: Tensor, mirrored: bool) -> tuple[Sight, Tensor, Tensor]:
+        """What is seen, density and velocity; mirrored: left and right exchanged."""
+        part = {name: array[indices].float() for name, array in self.arrays.items()}
+        density, velocity = part.pop("density"), part.pop("velocity")
+        if mirrored:
+            sign = torch.tensor([-1.0, 1.0, 1.0])
+            density, velocity = density.flip(1), velocity.flip(2) * sign[:, None, None, None]
+            last = SHAPE[0] - 1
+            matrices, count = part["matrices"], len(OFFSETS)
+            offset = matrices[..., 3:] + last * matrices[..., :1]
+            part["matrices"] = torch.cat([-matrices[..., :1], matrices[..., 1:3], offset], dim=-1)
+            part["source"] = part["source"] * sign + torch.tensor([float(last), 0.0, 0.0])
+            turned = torch.ones(NUM_CONDITIONS)
+            turned[count : 2 * count] = -1
+            part["conditions"] = part["conditions"] * turned
+        return Sight(**part), density, velocity
+
+
+def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor, list[float]]:
+    """What is to become small, and of each net the squared error of density and of velocity inside smoke, each in units of the
+    truth's own size."""
+    sight, density, velocity = lesson
+    weight = density / (density + 0.05 * density.amax((1, 2, 3), keepdim=True) + 1e-6)
+    weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    total, parts = torch.zeros(()), []
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        answers = net(sight, SHAPE)
+    for (ours, moves), share in zip(answers, (0.5, 1.0), strict=True):
+        of_density = (ours - density).square().sum((1, 2, 3)) / density.square().sum((1, 2, 3)).clamp_min(1e-3)
+        of_velocity = (weight * (moves - velocity).square().sum(1)).sum((1, 2, 3)) / _USUAL_SPEED**2
+        total = total + share * (of_density.mean() + 0.5 * of_velocity.mean())
+        parts += [of_density.mean().item(), of_velocity.mean().item()]
+    return total, parts
+
+
+def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
+    """Means over lessons held back: correlation of density, and of velocity inside smoke along the grid's axes."""
+    net.eval()
+    rows: list[list[float]] = []
+    with torch.no_grad():
+        for start in range(0, len(lessons), _BATCH):
+            sight, densities, velocities = lessons.batch(torch.arange(start, min(start + _BATCH, len(lessons))), mirrored=False)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                answers = net(sight, SHAPE)
+            for index in range(len(densities)):
+                density, velocity = densities[index].numpy(), velocities[index].numpy()
+                inside = density > 0.01 * density.max()
+                row = []
+                for ours, moves in answers:
+                    row.append(_correlation(ours[index].numpy(), density))
+                    row += [_correlation(moves[index, axis].numpy()[inside], velocity[axis][inside]) for axis in range(3)]
+                rows.append(row)
+    net.train()
+    names = [f"{name}{number}" for number in (1, 2) for name in ("density", "sideways", "depth", "up")]
+    return {name: round(float(value), 4) for name, value in zip(names, np.nanmean(rows, axis=0), strict=True)}
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    x, y = (values.astype(np.float64).ravel() - values.mean() for values in (a, b))
+    return float(x @ y / max(math.sqrt((x @ x) * (y @ y)), 1e-12))
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lessons", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--passes", type=int, default=20)
+    parser.add_argument("--rate", type=float, default=2e-3)
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    paths = sorted(given.lessons.glob("*.npz"))
+    held = [path for index, path in enumerate(paths) if index % _HELD_BACK == 5]
+    lessons, unseen = Lessons([path for path in paths if path not in held]), Lessons(held)
+    torch.manual_seed(0)
+    net = PlumeNet().to(memory_format=torch.channels_last_3d)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-4)
+    first = 0
+    if (given.out / "state.pt").exists():
+        state = torch.load(given.out / "state.pt", weights_only=True)
+        net.load_state_dict(state["net"])
+        optimiser.load_state_dict(state["optimiser"])
+        first = state["passes"]
+    num_steps = len(lessons) // _BATCH
+    for number in range(first, given.passes):
+        begin, sums = time.monotonic(), np.zeros(4)
+        order = torch.randperm(len(lessons), generator=torch.Generator().manual_seed(number))
+        for step in range(num_steps):
+            done = (number * num_steps + step) / (given.passes * num_steps)
+            for group in optimiser.param_groups:
+                group["lr"] = given.rate * min(1.0, 50 * done + 0.02) * 0.5 * (1 + math.cos(math.pi * done))
+            batch = lessons.batch(order[step * _BATCH : (step + 1) * _BATCH], mirrored=bool((step + number) % 2))
+            total, parts = losses(net, batch)
+            optimiser.zero_grad(set_to_none=True)
+            total.backward()
+            torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+            optimiser.step()
+            sums += parts
+        line: dict[str, object] = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
+        line |= {"seconds": round(time.monotonic() - begin, 1), **score(net, unseen)}
+        print(json.dumps(line), flush=True)
+        with open(given.out / "log.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+        with whole_file(given.out / "state.pt") as part:
+            torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "passes": number + 1}, part)
+        with whole_file(given.out / "plumes.npz") as part, open(part, "wb") as file:
+            save_weights(net, file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
