@@ -10,6 +10,16 @@ from backend.io.particles import ParticleFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeRecord:
+    """What the prior proposes for a frame, on the voxels of a grid that stands before its camera."""
+
+    density: np.ndarray  # [X, Y, Z] float32 1/m
+    velocity: np.ndarray  # [X, Y, Z, 3] float32 m/s, along the world's axes
+    from_world: np.ndarray  # [4, 4] float64: the world to the grid's own axes, whose zero is its middle
+    voxel_size: np.ndarray  # [] float64 m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhysicalRecord:
     """The physical particles of a frame, and what was learned about the fluid up to it."""
 

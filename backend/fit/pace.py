@@ -1,0 +1,56 @@
+"""How fast the smoke of a clip moves, roughly: over how many frames the prior should compare images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from backend.fit.region import Region
+
+_PAIRS = 12  # of frames that are looked at
+_CLEAR = 0.7  # px that smoke should move between two frames for its motion to be told
+_LONGEST = 16  # frames between them
+_STEP = 0.9  # voxels that smoke should move in a stride
+
+
+def stride_of(region: Region) -> int:
+    """Frames in which smoke moves about one voxel; 1 where nothing moves or everything is too fast."""
+    count = len(region.depths)
+    metres = _metres_a_frame(region)
+    if metres <= 0.0:
+        return 1
+    return int(np.clip(round(_STEP * region.voxel_size / metres), 1, max(1, count // 8)))
+
+
+def _metres_a_frame(region: Region) -> float:
+    """Median over smoke of how far it moves across the image, the camera's own motion taken out at the source's distance."""
+    count, gap, pixels = len(region.depths), 1, 0.0
+    while gap < count and gap <= _LONGEST:
+        firsts = np.linspace(0, count - 1 - gap, _PAIRS).astype(int)
+        steps = np.concatenate([_moved(region, int(first), gap) for first in firsts])
+        if steps[:, 1].sum() > 0.0:
+            steps = steps[np.argsort(steps[:, 0])]
+            reached = np.cumsum(steps[:, 1])
+            pixels = float(steps[np.searchsorted(reached, 0.5 * reached[-1]), 0]) / gap
+        if pixels * gap >= _CLEAR:
+            break
+        gap *= 2
+    view = region.views[0]
+    return pixels * float(view.to_camera(region.source[None])[0, 2]) / view.fx
+
+
+def _moved(region: Region, first: int, gap: int) -> np.ndarray:
+    """[N, 2]: how far smoke moved in px, and how much of it there is."""
+    before, after = region.depths[first], region.depths[first + gap]
+    scale = max(float(before.max(initial=0.0)), float(after.max(initial=0.0)), 1e-6)
+    coded = [np.rint(255 * np.sqrt(depth / scale)).astype(np.uint8) for depth in (before, after)]
+    if min(before.shape) < 16:
+        return np.zeros((0, 2))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(coded[0], coded[1], None)  # type: ignore[call-overload]
+    rows, columns = np.nonzero(before > 0.05 * scale)
+    pixels = np.stack([columns, rows], axis=1) + 0.5
+    views = region.views[first], region.views[first + gap]
+    depth = float(views[0].to_camera(region.source[None])[0, 2])
+    still, _ = views[1].project(views[0].unproject(pixels, np.full(len(pixels), depth)))
+    moved = pixels + flow[rows, columns] - still
+    return np.stack([np.linalg.norm(moved, axis=1), before[rows, columns]], axis=1)

@@ -1,0 +1,103 @@
+"""A volume that guides particles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backend.fit.guide import Guide, deposited
+from backend.fit.state import VolumeRecord
+from backend.geometry.camera import view_at
+from backend.prior.window import stand_before
+from synthetic.sweep import Orbit, orbit_cameras
+
+VIEW = view_at(orbit_cameras(Orbit(), width=180, height=320, fps=15.0, num_frames=135), 40)
+MIDDLE = np.array([0.5, -0.3, 8.0])
+STAND = stand_before(VIEW, MIDDLE, voxel_size=0.5, shape=(24, 24, 40))
+
+
+def world_of(voxels: np.ndarray) -> np.ndarray:
+    local = np.asarray(STAND.lattice.origin) + STAND.lattice.voxel_size * voxels
+    return (local - STAND.from_world[:3, 3]) @ STAND.from_world[:3, :3]
+
+
+def record(density: np.ndarray, velocity: np.ndarray | None = None) -> VolumeRecord:
+    return VolumeRecord(
+        density=density.astype(np.float32),
+        velocity=np.zeros((*density.shape, 3), np.float32) if velocity is None else velocity.astype(np.float32),
+        from_world=STAND.from_world,
+        voxel_size=np.asarray(0.5),
+    )
+
+
+def blob(centre: np.ndarray, size: float = 1.2) -> np.ndarray:
+    places = world_of(np.moveaxis(np.indices((24, 24, 40)), 0, -1).astype(float))
+    return np.exp(-0.5 * np.square((places - centre) / size).sum(axis=-1))
+
+
+def test_it_is_looked_up_in_the_world() -> None:
+    centre = MIDDLE + np.array([0.7, -0.4, 1.1])
+    guide = Guide(record(blob(centre)))
+    points = centre + np.random.default_rng(0).normal(0, 0.8, (200, 3))
+    wanted = np.exp(-0.5 * np.square((points - centre) / 1.2).sum(axis=1))
+    np.testing.assert_allclose(guide.density_at(points), wanted, atol=0.05)
+    assert guide.density_at(MIDDLE[None] + 100.0)[0] == 0.0
+    np.testing.assert_allclose(guide.places(MIDDLE[None])[:, 0], (11.5, 11.5, 19.5), atol=1e-9)
+
+
+def test_points_lie_on_their_rays_where_the_smoke_is() -> None:
+    centre = MIDDLE + np.array([0.0, 0.0, 1.0])
+    density = blob(centre, 0.8)
+    guide = Guide(record(np.where(density > 1e-3, density, 0.0)))
+    pixel, depth = VIEW.project(centre[None])
+    pixels = np.repeat(pixel, 4000, axis=0)
+    points, has_smoke = guide.points_on_rays(pixels, VIEW, seed=3)
+    assert has_smoke.all()
+    again, depths = VIEW.project(points)
+    np.testing.assert_allclose(again, pixels, atol=1e-6)
+    assert abs(depths.mean() - depth[0]) < 0.06
+    assert abs(depths.std() - 0.8) < 0.1
+    nowhere, has_smoke = guide.points_on_rays(np.array([[1.0, 1.0]]), VIEW, seed=3)
+    assert not has_smoke[0]
+    assert np.isfinite(nowhere).all()
+
+
+def test_what_it_carries_turns_with_the_flow() -> None:
+    """Solid rotation about the grid's middle: a quarter of a turn in 60 steps keeps the distance."""
+    places = world_of(np.moveaxis(np.indices((24, 24, 40)), 0, -1).astype(float)) - MIDDLE
+    rate = 0.5 * np.pi
+    velocity = np.stack([-rate * places[..., 1], rate * places[..., 0], 0 * places[..., 2]], axis=-1)
+    guide = Guide(record(blob(MIDDLE), velocity))
+    points = MIDDLE + np.array([[2.0, 0.0, 1.0]])
+    for _ in range(60):
+        points = guide.carried(points, guide, seconds=1 / 60)
+    np.testing.assert_allclose(points[0], MIDDLE + np.array([0.0, 2.0, 1.0]), atol=5e-3)
+
+
+def test_masses_are_shared_and_kept() -> None:
+    rng = np.random.default_rng(1)
+    places = rng.uniform(0.0, 7.0, (3, 500))
+    masses = rng.random(500)
+    total = deposited(places, masses, (8, 8, 8))
+    assert total.sum() == pytest.approx(masses.sum())
+    middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
+    np.testing.assert_allclose(middle, (places * masses).sum(axis=1) / masses.sum(), atol=1e-9)
+    assert deposited(np.full((3, 1), 40.0), np.ones(1), (8, 8, 8)).sum() == 0.0
+
+
+def test_it_asks_for_what_particles_lack() -> None:
+    density = blob(MIDDLE)
+    guide = Guide(record(density))
+    rng = np.random.default_rng(2)
+    mass = density.sum() * 0.5**3
+    points = MIDDLE + rng.normal(0, 1.2, (40_000, 3))
+    ratio, missing = guide.lack(points, np.full(40_000, mass / 40_000))
+    inside = np.linalg.norm(points - MIDDLE, axis=1) < 2.0
+    assert abs(np.median(ratio[inside]) - 1.0) < 0.05
+    assert missing.sum() * 0.5**3 < 0.06 * mass
+    ratio, missing = guide.lack(points, np.full(40_000, 0.5 * mass / 40_000))
+    assert abs(np.median(ratio[inside]) - 1.9) < 0.15
+    assert abs(missing.sum() * 0.5**3 / mass - 0.5) < 0.05
+    ratio, missing = guide.lack(np.zeros((0, 3)), np.zeros(0))
+    assert len(ratio) == 0
+    assert missing.sum() * 0.5**3 == pytest.approx(mass, rel=0.02)
