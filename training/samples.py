@@ -33,7 +33,7 @@ class Lesson:
 
 def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     """A random moment, camera and noise."""
-    stride = int(draw.choice([2, 3, 4]))
+    stride = int(draw.integers(2, 7))
     num_frames = int(draw.integers(60, NUM_FRAMES + 1))
     first = int(draw.integers(0, NUM_FRAMES - num_frames + 1))
     candidates = [t for t in range(first, first + num_frames) if t % VELOCITY_EVERY == 0]

@@ -12,6 +12,7 @@ import numpy as np
 
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
+from backend.fit.depths import Depths
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
@@ -33,8 +34,11 @@ CALM_COLOR = 0.25  # share of the way to the colour of its pixel
 class Appearance:
     """Fits Gaussians to frames of one scene."""
 
-    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: VisualConfig, seed: int) -> None:
+    def __init__(
+        self, scene: Scene, layers: Series[np.ndarray], config: VisualConfig, seed: int, depths: Depths | None = None
+    ) -> None:
         self.scene = scene
+        self.depths = depths or Depths(scene, layers)
         self.layers = layers
         self.config = config
         self.seed = seed
@@ -45,10 +49,10 @@ class Appearance:
 
     def _spacing(self, frame: int) -> float:
         """Mean distance m of the particles in a frame's solid of medial balls."""
-        view, tau = self.scene.views[frame], optical_depth(self.layers[frame])
-        prior = depth_prior.inflate(tau, view, self.scene.anchor)
+        tau = optical_depth(self.layers[frame])
+        prior = self.depths.prior(frame)
         is_smoke = tau > depth_prior.MASK_SHARE * max(float(np.percentile(tau, 99.5)), 1e-6)
-        area = pixel_mass(view, prior.center_depth)
+        area = pixel_mass(self.scene.views[frame], prior.center_depth)
         volume = float((2.0 * prior.half_thickness * area)[is_smoke].sum(dtype=np.float64))
         pixel = float(np.sqrt(area.mean()))
         return max((volume / self.config.num_particles) ** (1.0 / 3.0), pixel)
@@ -69,7 +73,7 @@ class Appearance:
         """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
-        record = self._calmed(record, layer, view, depth_prior.inflate(target, view, self.scene.anchor))
+        record = self._calmed(record, layer, view, self.depths.prior(frame))
         kept = config.consistency if consistency is None else consistency
         record = self._weighed(record, frame, target, consistency=kept)
         record = self.with_births(record, frame, target)
@@ -131,7 +135,7 @@ class Appearance:
         splat = renderer.forward(as_gaussians(record), view)
         missing = explain.missing_depth(splat, target)
         missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
-        prior = depth_prior.inflate(target, view, self.scene.anchor)
+        prior = self.depths.prior(frame)
         mass = missing * pixel_mass(view, prior.center_depth)
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))

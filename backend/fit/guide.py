@@ -3,14 +3,17 @@ and how much of it the particles still lack."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
+from backend.fit.depth_prior import MAX_SIDE, DepthPrior
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 
-_SAMPLES = 64  # along a ray
+_SAMPLES = 48  # along a ray
+_HALF_OVER_SPREAD = 6.0**0.5  # of the profile (1 - s^2)^1.5 on -1..1
 _BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 
@@ -41,22 +44,38 @@ class Guide:
         local = points @ matrix[:3, :3].T + matrix[:3, 3]
         return ((local - np.asarray(self.lattice.origin)) / self.lattice.voxel_size).T
 
-    def points_on_rays(self, pixels: np.ndarray, view: View, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """A random point [N, 3] of the smoke on the ray of each pixel [N, 2], and whether there is any on that ray [N]."""
-        draw = np.random.default_rng(seed)
+    def prior_of(self, view: View, solid: DepthPrior) -> DepthPrior:
+        """Where on each ray the volume's smoke is: the middle and, from its spread, the half thickness of the profile that
+        `solid` stands for; on rays that pass no smoke of the volume those of `solid`."""
+        height, width = solid.center_depth.shape
+        scale = min(1.0, MAX_SIDE / max(height, width))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        depths = self._depths(view)
+        columns, rows = np.meshgrid((np.arange(size[0]) + 0.5) / size[0] * width, (np.arange(size[1]) + 0.5) / size[1] * height)
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        points = view.unproject(np.repeat(pixels, _SAMPLES, axis=0), np.tile(depths, len(pixels)))
+        density = self.density_at(points).reshape(*columns.shape, _SAMPLES).astype(np.float64)
+        moments = [cv2.GaussianBlur((density * depths**power).sum(axis=2), (0, 0), 1.0) for power in range(3)]
+        is_known = moments[0] > _FLOOR * max(float(moments[0].max(initial=0.0)), 1e-12)
+        total = np.where(is_known, moments[0], 1.0)
+        middle = np.where(is_known, moments[1] / total, 0.0)
+        spread = np.sqrt(np.maximum(np.where(is_known, moments[2] / total, 0.0) - middle**2, 0.0))
+        known = cv2.resize(is_known.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+        share = np.maximum(known, 1e-6)
+        center = cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR) / share
+        half = cv2.resize(_HALF_OVER_SPREAD * spread, (width, height), interpolation=cv2.INTER_LINEAR) / share
+        return DepthPrior(
+            half_thickness=np.where(known > 0.5, half, solid.half_thickness),
+            center_depth=np.where(known > 0.5, center, solid.center_depth),
+            is_smoke=solid.is_smoke,
+        )
+
+    def _depths(self, view: View) -> np.ndarray:
+        """[_SAMPLES] m along the optical axis, through the whole grid."""
         middle = view.to_camera(-(self.record.from_world[:3, :3].T @ self.record.from_world[:3, 3])[None])[0, 2]
-        reach = 0.5 * self.lattice.voxel_size * float(np.linalg.norm(self.lattice.shape))
+        reach = 0.5 * self.lattice.voxel_size * float(np.linalg.norm(self.lattice.shape[:2]))
         near, far = max(middle - reach, 1e-3 * reach), max(middle + reach, 2e-3 * reach)
-        depths = near + (far - near) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        count = len(pixels)
-        points = view.unproject(np.repeat(pixels, _SAMPLES, axis=0), np.tile(depths, count))
-        share = self.density_at(points).reshape(count, _SAMPLES).astype(np.float64)
-        reached = np.cumsum(share, axis=1)
-        has_smoke = reached[:, -1] > 0.0
-        wanted = draw.random(count) * reached[:, -1]
-        index = np.minimum((reached <= wanted[:, None]).sum(axis=1), _SAMPLES - 1)
-        depth = depths[index] + (draw.random(count) - 0.5) * (far - near) / _SAMPLES
-        return view.unproject(pixels, depth), has_smoke
+        return near + (far - near) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
 
     def carried(self, positions: np.ndarray, next_guide: Guide, *, seconds: float) -> np.ndarray:
         """Positions [N, 3] m one frame later: Heun's rule between the velocities of both frames."""

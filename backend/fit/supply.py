@@ -9,6 +9,7 @@ import numpy as np
 
 from backend.fit import depth_prior, explain
 from backend.fit.carry import as_fluid
+from backend.fit.depths import Depths
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
@@ -33,6 +34,7 @@ class Supply:
 
     scene: Scene
     layers: Series[np.ndarray]
+    depths: Depths
     seed: int
     unit_mass: float
     parameters: fluids.FluidParameters
@@ -56,7 +58,7 @@ class Supply:
         )
 
     def prior(self, frame: int) -> depth_prior.DepthPrior:
-        return depth_prior.inflate(optical_depth(self.layers[frame]), self.scene.views[frame], self.scene.anchor)
+        return self.depths.prior(frame)
 
     def splat(self, record: PhysicalRecord, frame: int) -> tuple[renderer.Splat, np.ndarray]:
         """The particles' optical depth, and the frame's own, blurred to what particles of this size can show."""
@@ -110,12 +112,13 @@ def make_supply(
     drag: float = 0.0,  # 1/s
     solver_iterations: int = 3,
     max_substeps: int = 4,
+    depths: Depths | None = None,
 ) -> Supply:
     """Everything from the spacing of particles that fill the prior's solid where most smoke is, nothing from constants."""
     masses = [frame_mass(scene, layers[frame], frame) for frame in range(len(layers))]
     fullest = int(np.argmax(masses))
-    view, tau = scene.views[fullest], optical_depth(layers[fullest])
-    prior = depth_prior.inflate(tau, view, scene.anchor)
+    depths = depths or Depths(scene, layers)
+    view, prior = scene.views[fullest], depths.prior(fullest)
     solid = prior.half_thickness * prior.is_smoke
     points, _ = depth_prior.sample_points(solid, num_particles, prior, view, seed=seed, is_even=True)
     parameters = fluids.derive_parameters(points, drag=drag, solver_iterations=solver_iterations, max_substeps=max_substeps)
@@ -124,6 +127,7 @@ def make_supply(
     return Supply(
         scene=scene,
         layers=layers,
+        depths=depths,
         seed=seed,
         unit_mass=max(masses[fullest], 1e-30) / num_particles,
         parameters=replace(parameters, rest_density=max(parameters.rest_density, densest)),

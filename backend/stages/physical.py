@@ -17,9 +17,10 @@ from backend.contract.cameras import Cameras
 from backend.contract.job import PhysicalConfig, PublishedConfig
 from backend.fit import depth_prior, image_motion
 from backend.fit.carry import as_fluid
+from backend.fit.depths import Depths
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
-from backend.fit.state import PhysicalRecord
+from backend.fit.state import PhysicalRecord, VolumeRecord
 from backend.fit.supply import make_supply
 from backend.geometry.camera import View
 from backend.physics import fluid as fluids
@@ -43,13 +44,15 @@ def run(
     done: Series[PhysicalRecord],
     method: str = "default",
     published: PublishedConfig | None = None,  # the settings of the other methods
+    volumes: Series[VolumeRecord] | None = None,  # what is proposed for each frame; none: the images alone tell
 ) -> Iterator[PhysicalRecord]:
     """Yields the records of the frames behind those that are `done`."""
     if method != "default":
         settings, learns = published or PublishedConfig(), method == "as_published"
         yield from published_physical.run(layers, cameras, settings, report, learns_buoyancy=learns, seed=seed, done=done)
         return
-    fit = _Fit(make_scene(layers, cameras), layers, config, seed)
+    scene = make_scene(layers, cameras)
+    fit = _Fit(scene, layers, config, seed, Depths(scene, layers, volumes))
     first = len(done)
     record = done[first - 1] if first else None
     for frame in range(first, len(layers)):
@@ -62,14 +65,15 @@ def run(
 class _Fit:
     """The parts of the filter that do not change over time."""
 
-    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: PhysicalConfig, seed: int) -> None:
+    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: PhysicalConfig, seed: int, depths: Depths) -> None:
         self.scene = scene
         self.layers = layers
         self.config = config
         self.supply = make_supply(
             scene, layers, config.num_particles, seed=seed,
-            drag=config.drag, solver_iterations=config.solver_iterations, max_substeps=config.max_substeps,
+            drag=config.drag, solver_iterations=config.solver_iterations, max_substeps=config.max_substeps, depths=depths,
         )  # fmt: skip
+        self.depths = depths
         self.parameters = self.supply.parameters
 
     def start(self) -> PhysicalRecord:
@@ -91,7 +95,9 @@ class _Fit:
         predicted = state.positions
         wanted, confidence = self._observed(record.positions, frame - 1)
         gain = self.config.flow_gain * confidence[:, None]
-        lack = _sideways(record.positions + wanted - predicted, self.scene.views[frame])
+        lack = record.positions + wanted - predicted
+        if self.depths.volumes is None:
+            lack = _sideways(lack, self.scene.views[frame])
         positions = predicted + self._smooth(gain * lack, record)
         moved = self._corrected(replace(record, positions=positions), frame)
         moved = depth_prior.contain(moved, self.supply.prior(frame), self.scene.views[frame], share=CONTAINMENT)
@@ -103,7 +109,11 @@ class _Fit:
     # -- parts of a step ------------------------------------------------------------------------------------------
 
     def _observed(self, positions: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement [N, 3] m that the image asks for from `frame` to the next, and its confidence [N]."""
+        """Displacement [N, 3] m that volumes or images ask for from `frame` to the next, and its confidence [N]."""
+        guide, next_guide = self.depths.guide(frame), self.depths.guide(frame + 1)
+        if guide is not None and next_guide is not None:
+            moved = guide.carried(positions, next_guide, seconds=self.scene.seconds_per_frame)
+            return moved - positions, np.ones(len(positions))
         before, after = self.layers[frame], self.layers[frame + 1]
         flow = image_motion.dense_flow(before, after)
         views = (self.scene.views[frame], self.scene.views[frame + 1])

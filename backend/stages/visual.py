@@ -10,9 +10,10 @@ from backend.contract.cameras import Cameras
 from backend.contract.job import PublishedConfig, VisualConfig
 from backend.fit.appearance import Appearance
 from backend.fit.carry import carry, with_velocities
+from backend.fit.depths import Depths
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
-from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
 from backend.published import visual as published_visual
 from backend.reporting import Report
 
@@ -28,6 +29,7 @@ def run(
     done: Series[VisualRecord],
     method: str = "default",
     published: PublishedConfig | None = None,  # the settings of the other methods
+    volumes: Series[VolumeRecord] | None = None,  # what is proposed for each frame; none: the images alone tell
 ) -> Iterator[VisualRecord]:
     """Yields the records of the frames behind those that are `done`."""
     if method != "default":
@@ -37,7 +39,7 @@ def run(
         )
         return
     scene = make_scene(layers, cameras)
-    appearance = Appearance(scene, layers, config, seed)
+    appearance = Appearance(scene, layers, config, seed, Depths(scene, layers, volumes))
     first = len(done)
     record = done[first - 1] if first else None
     loss = 0.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
+from backend.fit.depth_prior import inflate, sample_points
 from backend.fit.guide import Guide, deposited
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
@@ -45,21 +47,23 @@ def test_it_is_looked_up_in_the_world() -> None:
     np.testing.assert_allclose(guide.places(MIDDLE[None])[:, 0], (11.5, 11.5, 19.5), atol=1e-9)
 
 
-def test_points_lie_on_their_rays_where_the_smoke_is() -> None:
-    centre = MIDDLE + np.array([0.0, 0.0, 1.0])
-    density = blob(centre, 0.8)
+def test_it_tells_the_middle_and_the_thickness_on_each_ray() -> None:
+    centre = MIDDLE + np.array([0.0, 0.6, 1.0])
+    density = blob(centre, 0.9)
     guide = Guide(record(np.where(density > 1e-3, density, 0.0)))
+    tau = np.zeros((VIEW.height, VIEW.width), np.float32)
     pixel, depth = VIEW.project(centre[None])
-    pixels = np.repeat(pixel, 4000, axis=0)
-    points, has_smoke = guide.points_on_rays(pixels, VIEW, seed=3)
-    assert has_smoke.all()
+    cv2.circle(tau, (int(pixel[0, 0]), int(pixel[0, 1])), 25, 1.0, -1)
+    solid = inflate(tau, VIEW, MIDDLE)
+    prior = guide.prior_of(VIEW, solid)
+    row, column = int(pixel[0, 1]), int(pixel[0, 0])
+    assert abs(prior.center_depth[row, column] - depth[0]) < 0.08
+    assert abs(prior.half_thickness[row, column] - np.sqrt(6) * 0.9) < 0.25
+    np.testing.assert_array_equal(prior.center_depth[:20], solid.center_depth[:20])  # no ray up there meets the volume
+    points, pixels = sample_points(tau, 5000, prior, VIEW, seed=0)
     again, depths = VIEW.project(points)
     np.testing.assert_allclose(again, pixels, atol=1e-6)
-    assert abs(depths.mean() - depth[0]) < 0.06
-    assert abs(depths.std() - 0.8) < 0.1
-    nowhere, has_smoke = guide.points_on_rays(np.array([[1.0, 1.0]]), VIEW, seed=3)
-    assert not has_smoke[0]
-    assert np.isfinite(nowhere).all()
+    assert abs(depths.std() - 0.9) < 0.1
 
 
 def test_what_it_carries_turns_with_the_flow() -> None:
