@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +40,8 @@ def run(
         )
         return
     scene = make_scene(layers, cameras)
-    appearance = Appearance(scene, layers, config, seed, Depths(scene, layers, volumes))
+    depths = Depths(scene, layers, volumes)
+    appearance = Appearance(scene, layers, config, seed, depths)
     first = len(done)
     record = done[first - 1] if first else None
     loss = 0.0
@@ -48,8 +50,24 @@ def run(
         if record is None:
             record = appearance.empty()
         else:
-            record = carry(record, fluid[frame], seconds=scene.seconds_per_frame)
+            record = _carried(record, frame, depths, fluid)
         record, loss = appearance.look(record, frame)
-        record = with_velocities(record, fluid[frame])
+        record = _with_velocities(record, frame, depths, fluid)
         yield record
     report.progress(len(layers), len(layers), loss=loss)
+
+
+def _carried(record: VisualRecord, frame: int, depths: Depths, fluid: Series[PhysicalRecord]) -> VisualRecord:
+    """The Gaussians of the frame before, moved into this one: by the volumes, else by the physical particles."""
+    seconds = depths.scene.seconds_per_frame
+    before, after = depths.guide(frame - 1), depths.guide(frame)
+    if before is None or after is None:
+        return carry(record, fluid[frame], seconds=seconds)
+    return replace(record, positions=before.carried(record.positions, after, seconds=seconds))
+
+
+def _with_velocities(record: VisualRecord, frame: int, depths: Depths, fluid: Series[PhysicalRecord]) -> VisualRecord:
+    guide = depths.guide(frame)
+    if guide is None:
+        return with_velocities(record, fluid[frame])
+    return replace(record, velocities=guide.velocity_at(record.positions).astype(np.float32))
