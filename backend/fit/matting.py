@@ -75,7 +75,7 @@ def solve_opacity(
 
     sum_k ((a J_k - u c_k - (J_k - I_k)) / noise_k)^2 + ((u - brightness a) / (spread a))^2 + (a / opacity spread)^2.
     Where that asks for smoke darker than its shaded side may be, brightness is held there and opacity solved alone.
-    For spread -> 0 this is a = (J - I).(J - S) / |J - S|^2, the transmittance formula of METHOD solved for opacity.
+    For spread -> 0 this is a = (J - I).(J - S) / |J - S|^2, the published transmittance (I - S) / (J - S) solved for opacity.
     """
     weight = 1.0 / coded_noise_to_linear(np.maximum(background, image), max(noise, _MOVING_NOISE)) ** 2
     difference = background - image

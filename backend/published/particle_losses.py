@@ -12,7 +12,7 @@ from backend.physics.fluid import SPACINGS_PER_LENGTH, FluidParameters, FluidSta
 from backend.physics.fluid_gradient import number_density_gradient, rollout
 from backend.physics.neighbours import find_neighbours
 
-SPACING_WEIGHT, ANCHOR_WEIGHT, DENSITY_WEIGHT, AHEAD_WEIGHT = 0.1, 0.1, 1.0, 0.1  # METHOD: FluidNexus
+SPACING_WEIGHT, ANCHOR_WEIGHT, DENSITY_WEIGHT, AHEAD_WEIGHT = 0.1, 0.1, 1.0, 0.1  # FluidNexus (Gao et al. 2025)
 
 
 def anchor_loss(positions: np.ndarray, predicted: np.ndarray, length: float) -> tuple[float, np.ndarray]:

@@ -1,6 +1,6 @@
 """The physical stage as published: the fluid predicts a frame, and gradient steps on positions bring it to the picture.
 
-FluidNexus, by METHOD section 3, with WildSmoke's learnable buoyancy (supplement 7.6.1). A frame's loss:
+FluidNexus (Gao et al. 2025) with WildSmoke's learnable buoyancy (supplement 7.6.1). A frame's loss:
 
     0.8 L1 + 0.2 (1 - SSIM) + 0.1 spacing + 0.1 anchor + 1 density + 0.1 density one step ahead
 

@@ -1,6 +1,6 @@
 """The visual stage as published: Gaussians with axes of their own ride on the physical ones; their look is fitted.
 
-FluidNexus, by METHOD section 3, with WildSmoke's frequency loss (supplement 7.6.2). A frame's loss:
+FluidNexus (Gao et al. 2025) with WildSmoke's frequency loss (supplement 7.6.2). A frame's loss:
 
     0.8 L1 + 0.2 (1 - SSIM) + 0.001 w(iteration) frequency + 10 colour + 8 opacity + 0.1 rotation
 

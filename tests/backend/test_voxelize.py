@@ -137,7 +137,7 @@ def test_wide_particles_keep_their_mass_too() -> None:
 
 @pytest.mark.parametrize(("scale", "error"), [(0.8, 0.36), (1.25, 0.13), (3.0, 0.035)])
 def test_seen_through_linear_interpolation_it_is_the_projected_gaussian(scale: float, error: float) -> None:
-    """tau = m / (2 pi s^2) exp(-r^2 / 2 s^2), METHOD's pixel model, along rays through the interpolated grid."""
+    """tau = m / (2 pi s^2) exp(-r^2 / 2 s^2), the pixel model of docs/method.md, along rays through the interpolated grid."""
     frame = particles([[20.2, 20.0, 19.7]], scale, masses=np.array([1.0]))
     grid = voxelize(frame, cube(41))["density"].astype(np.float64)
     fine = np.linspace(20.0 - 5 * scale, 20.0 + 5 * scale, 201)
