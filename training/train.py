@@ -25,7 +25,7 @@ from backend.prior.window import NUM_CONDITIONS, OFFSETS
 from training.samples import SHAPE
 
 _HELD_BACK = 10  # every such plume
-_USUAL_SPEED = 0.5  # voxels a stride
+_SLOW = 0.2  # voxels a stride: motion that need not be known better than that
 _BATCH = 8
 
 
@@ -63,12 +63,13 @@ def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor,
     sight, density, velocity = lesson
     weight = density / (density + 0.05 * density.amax((1, 2, 3), keepdim=True) + 1e-6)
     weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    speed = (weight * velocity.square().sum(1)).sum((1, 2, 3)) + _SLOW**2
     total, parts = torch.zeros(()), []
     with torch.autocast("cpu", dtype=torch.bfloat16):
         answers = net(sight, SHAPE)
     for (ours, moves), share in zip(answers, (0.5, 1.0), strict=True):
         of_density = (ours - density).square().sum((1, 2, 3)) / density.square().sum((1, 2, 3)).clamp_min(1e-3)
-        of_velocity = (weight * (moves - velocity).square().sum(1)).sum((1, 2, 3)) / _USUAL_SPEED**2
+        of_velocity = (weight * (moves - velocity).square().sum(1)).sum((1, 2, 3)) / speed
         total = total + share * (of_density.mean() + 0.5 * of_velocity.mean())
         parts += [of_density.mean().item(), of_velocity.mean().item()]
     return total, parts

@@ -83,7 +83,7 @@ class PlumeNet(nn.Module):
     """Sight -> of the first net and of the second: density [B, X, Y, Z] in scale/voxel, velocity [B, 3, X, Y, Z] in voxels a
     stride. shape: X, Y and Z, multiples of 8 with three widths."""
 
-    def __init__(self, widths: tuple[int, ...] = (64, 96, 128)) -> None:
+    def __init__(self, widths: tuple[int, ...] = (64, 88, 112)) -> None:
         super().__init__()
         self.widths = widths
         self.first = UNet(len(OFFSETS) + 3, widths)
