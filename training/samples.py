@@ -12,11 +12,11 @@ from backend.field.rays import optical_depth
 from backend.fit.region import PIXELS_A_CELL
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
+from backend.prior.predict import SHAPE
 from backend.prior.window import Stand, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 
-SHAPE = (24, 24, 40)
 _CELLS = (0.32, 0.56)  # m, the least and the largest voxel
 _PIXELS = (56, 96)  # width, height
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell

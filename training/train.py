@@ -20,9 +20,9 @@ from torch import Tensor
 
 from backend.io.atomic import whole_file
 from backend.prior.network import PlumeNet, Sight
-from backend.prior.predict import save_weights
+from backend.prior.predict import SHAPE, save_weights
 from backend.prior.window import NUM_CONDITIONS, OFFSETS
-from training.samples import SHAPE
+from backend.score.measures import correlation
 
 _HELD_BACK = 10  # every such plume
 _SLOW = 0.2  # voxels a stride: motion that need not be known better than that
@@ -89,17 +89,12 @@ def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
                 inside = density > 0.01 * density.max()
                 row = []
                 for ours, moves in answers:
-                    row.append(_correlation(ours[index].numpy(), density))
-                    row += [_correlation(moves[index, axis].numpy()[inside], velocity[axis][inside]) for axis in range(3)]
+                    row.append(correlation(ours[index].numpy(), density))
+                    row += [correlation(moves[index, axis].numpy()[inside], velocity[axis][inside]) for axis in range(3)]
                 rows.append(row)
     net.train()
     names = [f"{name}{number}" for number in (1, 2) for name in ("density", "sideways", "depth", "up")]
     return {name: round(float(value), 4) for name, value in zip(names, np.nanmean(rows, axis=0), strict=True)}
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    x, y = (values.astype(np.float64).ravel() - values.mean() for values in (a, b))
-    return float(x @ y / max(math.sqrt((x @ x) * (y @ y)), 1e-12))
 
 
 def main(arguments: list[str]) -> int:

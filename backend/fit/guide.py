@@ -11,6 +11,7 @@ from backend.fit.depth_prior import MAX_SIDE, DepthPrior
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
+from backend.prior.window import Stand
 
 _SAMPLES = 48  # along a ray
 _HALF_OVER_SPREAD = 6.0**0.5  # of the profile (1 - s^2)^1.5 on -1..1
@@ -27,6 +28,7 @@ class Guide:
         shape = record.density.shape
         origin = tuple(-0.5 * size * (count - 1) for count in shape)
         self.lattice = Lattice(origin=origin, voxel_size=size, shape=shape)  # type: ignore[arg-type]
+        self.stand = Stand(lattice=self.lattice, from_world=record.from_world)
         self.density = record.density.astype(np.float32)
 
     def density_at(self, points: np.ndarray) -> np.ndarray:
@@ -40,9 +42,7 @@ class Guide:
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """[3, N] voxels from the first one's centre."""
-        matrix = self.record.from_world
-        local = points @ matrix[:3, :3].T + matrix[:3, 3]
-        return ((local - np.asarray(self.lattice.origin)) / self.lattice.voxel_size).T
+        return self.stand.voxels(points).T
 
     def prior_of(self, view: View, solid: DepthPrior) -> DepthPrior:
         """Where on each ray the volume's smoke is: the middle and, from its spread, the half thickness of the profile that

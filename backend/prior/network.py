@@ -11,6 +11,7 @@ channels: wide layers on few cells are what processors are good at.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
@@ -140,7 +141,7 @@ def follow(velocity: Tensor, voxels: Tensor, strides: Tensor) -> Tensor:
 
 
 def _density_and_velocity(out: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-    return functional.softplus(out[:, 0]) * (_USUAL_SHARE / 0.6931) * now, out[:, 1:]
+    return functional.softplus(out[:, 0]) * (_USUAL_SHARE / math.log(2)) * now, out[:, 1:]
 
 
 def _folded(x: Tensor) -> Tensor:

@@ -10,16 +10,13 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from backend.geometry.camera import View
-from backend.geometry.lattice import Lattice
 from backend.prior.network import PlumeNet, Sight
 from backend.prior.window import Stand, look, stand_before
 
 WEIGHTS = Path(__file__).resolve().parent / "plumes.npz"
 SHAPE = (24, 24, 40)
-CELLS_IN_SIGHT = 43.0  # voxels from the lower to the upper edge of the picture, at the smoke's distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,19 +26,6 @@ class Proposal:
     stand: Stand
     density: np.ndarray
     velocity: np.ndarray
-
-    def density_on(self, lattice: Lattice) -> np.ndarray:
-        """[X, Y, Z] 1/m on voxels of the world; zero beyond the grid."""
-        return ndimage.map_coordinates(self.density, self._places(lattice), order=1, mode="constant").astype(np.float32)
-
-    def velocity_on(self, lattice: Lattice) -> np.ndarray:
-        """[X, Y, Z, 3] m/s on voxels of the world; that of the nearest voxel beyond the grid."""
-        at = self._places(lattice)
-        found = [ndimage.map_coordinates(self.velocity[..., axis], at, order=1, mode="nearest") for axis in range(3)]
-        return np.stack(found, axis=-1).astype(np.float32)
-
-    def _places(self, lattice: Lattice) -> np.ndarray:
-        return np.moveaxis(self.stand.voxels(lattice.centres()), -1, 0)
 
 
 class Prior:

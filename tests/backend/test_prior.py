@@ -11,10 +11,12 @@ import pytest
 import torch
 
 from backend.field.rays import at_voxels
+from backend.fit.guide import Guide
+from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View, view_at
 from backend.geometry.lattice import Lattice
 from backend.prior.network import PlumeNet, Sight, _folded, _unfolded, follow, seen_at
-from backend.prior.predict import SHAPE, Prior, Proposal, save_weights
+from backend.prior.predict import SHAPE, Prior, save_weights
 from backend.prior.window import OFFSETS, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 
@@ -156,8 +158,11 @@ def test_a_proposal_is_looked_up_in_the_world() -> None:
     stand = stand_before(view(10), np.array([0.0, 0.0, 8.0]), voxel_size=0.5, shape=SHAPE)
     world = stand.lattice.centres() @ stand.from_world[:3, :3] - stand.from_world[:3, 3] @ stand.from_world[:3, :3]
     density = np.exp(-0.5 * np.square((world - (1.0, -0.5, 9.0)) / 1.2).sum(axis=-1)).astype(np.float32)
-    proposal = Proposal(stand=stand, density=density, velocity=world.astype(np.float32))
+    guide = Guide(
+        VolumeRecord(density=density, velocity=world.astype(np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.5))
+    )
     lattice = Lattice(origin=(-3.0, -3.0, 5.0), voxel_size=0.4, shape=(15, 15, 20))
     wanted = np.exp(-0.5 * np.square((lattice.centres() - (1.0, -0.5, 9.0)) / 1.2).sum(axis=-1))
-    np.testing.assert_allclose(proposal.density_on(lattice), wanted, atol=0.06)
-    np.testing.assert_allclose(proposal.velocity_on(lattice), lattice.centres(), atol=1e-4)
+    points = lattice.centres().reshape(-1, 3)
+    np.testing.assert_allclose(guide.density_at(points), wanted.ravel(), atol=0.06)
+    np.testing.assert_allclose(guide.velocity_at(points), points, atol=1e-4)
