@@ -65,7 +65,7 @@ def cases(*, has_unbiased: bool) -> list[Case]:
         for layer in ("clip", "smoke")
         for denoised in (False, True)
         for biased in (biases if layer == "clip" else (True,))
-        for samples in _SAMPLES[: 8 if layer == "clip" and biased else 5]
+        for samples in _SAMPLES[: (8 if biased else 7) if layer == "clip" else 5]
     ]
     base = Quality(samples=64)
     for bounces in (0, 1, 2, 4, 8, 16):
