@@ -11,6 +11,7 @@ SECTIONS = (
     ("frames", "Frames"),
     ("extraction", "Smoke Layer"),
     ("cameras", "Camera"),
+    ("volume", "Depth"),
     ("physical", "Motion"),
     ("visual", "Look"),
     ("published", "Published Methods"),

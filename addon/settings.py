@@ -109,6 +109,23 @@ class WILDSMOKE_PG_cameras(bpy.types.PropertyGroup):
     )
 
 
+class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
+    """Where in depth the smoke is and how it moves."""
+
+    use_prior: BoolProperty(
+        name="Trained Prior",
+        description="Ask a network trained on simulated smoke for depth and motion; else the images tell alone",
+        default=False,
+    )
+    stride: IntProperty(
+        name="Stride",
+        description="Frames between the images that it compares; 0 finds it from the motion",
+        default=0,
+        min=0,
+        max=60,
+    )
+
+
 class WILDSMOKE_PG_physical(bpy.types.PropertyGroup):
     """Position-based fluid: where the smoke moves."""
 
@@ -243,6 +260,7 @@ class WILDSMOKE_PG_config(bpy.types.PropertyGroup):
     frames: PointerProperty(type=WILDSMOKE_PG_frames)
     extraction: PointerProperty(type=WILDSMOKE_PG_extraction)
     cameras: PointerProperty(type=WILDSMOKE_PG_cameras)
+    volume: PointerProperty(type=WILDSMOKE_PG_volume)
     physical: PointerProperty(type=WILDSMOKE_PG_physical)
     visual: PointerProperty(type=WILDSMOKE_PG_visual)
     published: PointerProperty(type=WILDSMOKE_PG_published)
@@ -370,6 +388,7 @@ CLASSES = (
     WILDSMOKE_PG_frames,
     WILDSMOKE_PG_extraction,
     WILDSMOKE_PG_cameras,
+    WILDSMOKE_PG_volume,
     WILDSMOKE_PG_physical,
     WILDSMOKE_PG_visual,
     WILDSMOKE_PG_published,

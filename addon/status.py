@@ -14,6 +14,7 @@ STAGE_LABELS = {
     "frames": "Reading the clip",
     "smoke": "Finding the smoke",
     "cameras": "Placing the camera",
+    "volume": "Judging the depth",
     "physical": "Fitting the motion",
     "visual": "Fitting the look",
     "forecast": "Forecasting",

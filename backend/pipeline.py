@@ -1,6 +1,6 @@
 """The pipeline: alone knows the order of the stages, alone reads and writes their files, resumes and stops.
 
-video -> frames -> smoke layer -> cameras -> physical particles -> visual particles -> forecast -> export
+video -> frames -> smoke layer -> cameras -> (volumes) -> physical particles -> visual particles -> forecast -> export
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.population import buoyancy_of
-from backend.fit.state import PhysicalRecord, VisualRecord, particle_frame
+from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
 from backend.io.frame_stack import FrameStack, FrameStackWriter
@@ -33,17 +34,31 @@ from backend.io.job_folder import JobFolder, file_fingerprint, fingerprint
 from backend.io.particles import Particles, ParticlesInfo, ParticlesWriter, read_particles
 from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_stamp, stamp, write_records
 from backend.io.video import Clip, open_clip
+from backend.prior.weights import WEIGHTS, weights_fingerprint
 from backend.stages import cameras as cameras_stage
 from backend.stages import export, forecast, frames, physical, smoke, visual
 
-STAGES = ("frames", "smoke", "cameras", "physical", "visual", "forecast", "export")
+STAGES = ("frames", "smoke", "cameras", "volume", "physical", "visual", "forecast", "export")
 
 
-def run_job(path: Path, sink: EventSink, stop: StopRequest) -> Result:
-    """Run the job in a folder to its end, taking up what is there. Raises BackendError, Cancelled."""
+def stages_of(config: Config) -> tuple[str, ...]:
+    """The stages of a job with these settings, in order."""
+    return STAGES if _asks_prior(config) else tuple(name for name in STAGES if name != "volume")
+
+
+def _asks_prior(config: Config) -> bool:
+    return config.volume.use_prior and config.method == "default"
+
+
+def run_job(path: Path, sink: EventSink, stop: StopRequest, *, weights: Path = WEIGHTS) -> Result:
+    """Run the job in a folder to its end, taking up what is there. Raises BackendError, Cancelled.
+
+    weights: of the prior, where the settings ask it.
+    """
     folder = JobFolder(path)
     job = read_job(folder.job)
     folder.create()
+    pipeline = Pipeline(folder, job, sink, stop, weights=weights)
     other = running.running_pid(path)
     if other is not None:
         raise BackendError(
@@ -56,7 +71,6 @@ def run_job(path: Path, sink: EventSink, stop: StopRequest) -> Result:
     if not Path(os.environ["NUMBA_CACHE_DIR"]).is_dir():
         message = "First run of this version: the kernels are compiled as they are needed, which takes about a minute in all."
         sink.send(events.Warning(code="first_run", message=message))
-    pipeline = Pipeline(folder, job, sink, stop)
     try:
         return pipeline.run()
     except BackendError as error:
@@ -69,10 +83,13 @@ def run_job(path: Path, sink: EventSink, stop: StopRequest) -> Result:
 class Pipeline:
     """One run of one job. Each method is one arrow of the data flow and returns the fingerprint of what it made."""
 
-    def __init__(self, folder: JobFolder, job: Job, sink: EventSink, stop: StopRequest) -> None:
+    def __init__(self, folder: JobFolder, job: Job, sink: EventSink, stop: StopRequest, *, weights: Path = WEIGHTS) -> None:
         self.folder = folder
         self.job = job
         self.config: Config = job.config()
+        self.stages = stages_of(self.config)
+        self.weights = weights
+        self.weights_mark = weights_fingerprint(weights) if _asks_prior(self.config) else None
         self.sink = sink
         self.stop = stop
         self.stage = ""
@@ -85,8 +102,9 @@ class Pipeline:
             frames_mark = self._frames(clip)
             smoke_mark = self._smoke(frames_mark, has_alpha=clip.has_alpha)
             cameras_mark = self._cameras(smoke_mark, given, size=(clip.width, clip.height))
-        physical_mark = self._physical(smoke_mark, cameras_mark)
-        visual_mark = self._visual(smoke_mark, cameras_mark, physical_mark)
+        volume_marks = self._volume(smoke_mark, cameras_mark)
+        physical_mark = self._physical(smoke_mark, cameras_mark, *volume_marks)
+        visual_mark = self._visual(smoke_mark, cameras_mark, physical_mark, *volume_marks)
         forecast_mark = self._forecast(smoke_mark, cameras_mark, visual_mark)
         result = self._export(source, cameras_mark, visual_mark, forecast_mark)
         write_text(self.folder.timing, json.dumps(self.seconds, indent=2))
@@ -160,18 +178,44 @@ class Pipeline:
         self._stage("cameras", mark, _json_entry(self.folder.cameras, "fingerprint"), write)
         return mark
 
-    def _physical(self, smoke_mark: str, cameras_mark: str) -> str:
-        mark = fingerprint(
-            "physical", self.config.physical, str(self.config.seed), smoke_mark, cameras_mark, *self._method_marks()
-        )
+    def _volume(self, smoke_mark: str, cameras_mark: str) -> tuple[str, ...]:
+        """What the particles follow from besides, in a tuple; an empty one where the prior is not asked."""
+        if self.weights_mark is None:
+            return ()
+        mark = fingerprint("volume", self.config.volume, self.weights_mark, smoke_mark, cameras_mark)
 
         def write(report: StageReport) -> None:
+            from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
+            from backend.stages import volume
+
             with open_stage_file(self.folder.smoke) as file:
+                parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
+                records = volume.run(
+                    FrameStack(file, "smoke"), read_cameras(self.folder.cameras), report,
+                    prior=Prior(self.weights), done=parts, stride=self.config.volume.stride,
+                )  # fmt: skip
+                _keep(parts, records)
+            write_records(self.folder.volume, mark, parts)
+            parts.remove()
+
+        self._stage("volume", mark, read_stamp(self.folder.volume), write)
+        return (mark,)
+
+    def _volumes(self) -> AbstractContextManager[RecordFile[VolumeRecord] | None]:
+        """What the prior proposes, open for reading; None where it is not asked."""
+        return nullcontext() if self.weights_mark is None else RecordFile(self.folder.volume, VolumeRecord)
+
+    def _physical(self, smoke_mark: str, cameras_mark: str, *volume_marks: str) -> str:
+        inputs = (smoke_mark, cameras_mark, *volume_marks, *self._method_marks())
+        mark = fingerprint("physical", self.config.physical, str(self.config.seed), *inputs)
+
+        def write(report: StageReport) -> None:
+            with open_stage_file(self.folder.smoke) as file, self._volumes() as volumes:
                 layers = FrameStack(file, "smoke")
                 parts = RecordFolder(self.folder.physical.with_suffix(".parts"), mark, PhysicalRecord)
                 records = physical.run(
-                    layers, read_cameras(self.folder.cameras), self.config.physical, report,
-                    seed=self.config.seed, done=parts, method=self.config.method, published=self.config.published,
+                    layers, read_cameras(self.folder.cameras), self.config.physical, report, seed=self.config.seed,
+                    done=parts, method=self.config.method, published=self.config.published, volumes=volumes,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.physical, mark, parts)
@@ -180,17 +224,21 @@ class Pipeline:
         self._stage("physical", mark, read_stamp(self.folder.physical), write)
         return mark
 
-    def _visual(self, smoke_mark: str, cameras_mark: str, physical_mark: str) -> str:
-        inputs = (smoke_mark, cameras_mark, physical_mark, *self._method_marks())
+    def _visual(self, smoke_mark: str, cameras_mark: str, physical_mark: str, *volume_marks: str) -> str:
+        inputs = (smoke_mark, cameras_mark, physical_mark, *volume_marks, *self._method_marks())
         mark = fingerprint("visual", self.config.visual, str(self.config.seed), *inputs)
 
         def write(report: StageReport) -> None:
-            with open_stage_file(self.folder.smoke) as file, RecordFile(self.folder.physical, PhysicalRecord) as fluid:
+            with (
+                open_stage_file(self.folder.smoke) as file,
+                RecordFile(self.folder.physical, PhysicalRecord) as fluid,
+                self._volumes() as volumes,
+            ):
                 layers = FrameStack(file, "smoke")
                 parts = RecordFolder(self.folder.visual.with_suffix(".parts"), mark, VisualRecord)
                 records = visual.run(
-                    layers, read_cameras(self.folder.cameras), fluid, self.config.visual, report,
-                    seed=self.config.seed, done=parts, method=self.config.method, published=self.config.published,
+                    layers, read_cameras(self.folder.cameras), fluid, self.config.visual, report, seed=self.config.seed,
+                    done=parts, method=self.config.method, published=self.config.published, volumes=volumes,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.visual, mark, parts)
@@ -275,6 +323,7 @@ class Pipeline:
                     "source_fingerprint": source,
                     "preset": self.job.preset,
                     "settings": asdict(self.config),
+                    **({"prior_fingerprint": self.weights_mark} if self.weights_mark else {}),
                 },
                 fingerprint=mark,
             )
@@ -329,7 +378,7 @@ class Pipeline:
         self.stop.check()
         self.stage = name
         is_done = found == mark
-        self.sink.send(events.Stage(name=name, index=STAGES.index(name), count=len(STAGES), skipped=is_done))
+        self.sink.send(events.Stage(name=name, index=self.stages.index(name), count=len(self.stages), skipped=is_done))
         kept = _json_entry(self._warnings_path, name)
         if is_done:
             for entry in kept or []:
@@ -348,7 +397,7 @@ class Pipeline:
         return self.folder.stages / "warnings.json"
 
     def _all_warnings(self) -> dict[str, list[dict[str, str]]]:
-        return {name: _json_entry(self._warnings_path, name) or [] for name in STAGES}
+        return {name: _json_entry(self._warnings_path, name) or [] for name in self.stages}
 
 
 def _keep(parts: RecordFolder[Any], records: Iterator[Any]) -> None:

@@ -97,6 +97,21 @@ class CamerasConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeConfig:
+    """Where in depth the smoke is and how it moves, as a prior trained on simulated smoke proposes it.
+
+    use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
+    stride: frames between the images that it compares; 0 finds it from the motion.
+    """
+
+    use_prior: bool = False
+    stride: int = 0
+
+    def __post_init__(self) -> None:
+        _check("stride", self.stride, 0, 60)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhysicalConfig:
     """Position-based fluid: where the smoke moves.
 
@@ -218,6 +233,7 @@ class Config:
     frames: FramesConfig = field(default_factory=FramesConfig)
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
     physical: PhysicalConfig = field(default_factory=PhysicalConfig)
     visual: VisualConfig = field(default_factory=VisualConfig)
     published: PublishedConfig = field(default_factory=PublishedConfig)

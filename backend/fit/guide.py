@@ -29,7 +29,8 @@ class Guide:
         origin = tuple(-0.5 * size * (count - 1) for count in shape)
         self.lattice = Lattice(origin=origin, voxel_size=size, shape=shape)  # type: ignore[arg-type]
         self.stand = Stand(lattice=self.lattice, from_world=record.from_world)
-        self.density = record.density.astype(np.float32)
+        self.density = record.density.astype(np.float32) * np.float32(record.density_unit)
+        self.velocity = record.velocity.astype(np.float32) * np.float32(record.velocity_unit)
 
     def density_at(self, points: np.ndarray) -> np.ndarray:
         """[N] 1/m; zero outside the grid."""
@@ -38,7 +39,7 @@ class Guide:
     def velocity_at(self, points: np.ndarray) -> np.ndarray:
         """[N, 3] m/s; outside the grid that of its nearest voxel."""
         at = self.places(points)
-        return np.stack([_looked_up(self.record.velocity[..., axis], at, "nearest") for axis in range(3)], axis=1)
+        return np.stack([_looked_up(self.velocity[..., axis], at, "nearest") for axis in range(3)], axis=1)
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """[3, N] voxels from the first one's centre."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,12 +11,17 @@ from backend.io.particles import ParticleFrame
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VolumeRecord:
-    """What the prior proposes for a frame, on the voxels of a grid that stands before its camera."""
+    """What the prior proposes for a frame, on the voxels of a grid that stands before its camera.
 
-    density: np.ndarray  # [X, Y, Z] float32 1/m
-    velocity: np.ndarray  # [X, Y, Z, 3] float32 m/s, along the world's axes
+    The units are the records' own, so that half precision does for scenes of any size and pace.
+    """
+
+    density: np.ndarray  # [X, Y, Z] float16 or float32, density_unit
+    velocity: np.ndarray  # [X, Y, Z, 3] float16 or float32, velocity_unit, along the world's axes
     from_world: np.ndarray  # [4, 4] float64: the world to the grid's own axes, whose zero is its middle
     voxel_size: np.ndarray  # [] float64 m
+    density_unit: np.ndarray = field(default_factory=lambda: np.asarray(1.0))  # [] float64 1/m
+    velocity_unit: np.ndarray = field(default_factory=lambda: np.asarray(1.0))  # [] float64 m/s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,6 +30,7 @@ class JobFolder:
         self.stages = path / "stages"
         self.frames = self.stages / "frames.h5"
         self.smoke = self.stages / "smoke.h5"
+        self.volume = self.stages / "volume.h5"
         self.physical = self.stages / "physical.h5"
         self.visual = self.stages / "visual.h5"
         self.forecast = self.stages / "forecast.h5"

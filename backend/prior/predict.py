@@ -7,15 +7,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.prior.network import PlumeNet, Sight
+from backend.prior.weights import HINT, WEIGHTS
 from backend.prior.window import Stand, look, stand_before
 
-WEIGHTS = Path(__file__).resolve().parent / "plumes.npz"
 SHAPE = (24, 24, 40)
 
 
@@ -29,15 +31,14 @@ class Proposal:
 
 
 class Prior:
-    """The trained network. Raises FileNotFoundError without its weights."""
+    """The trained network; several threads may ask it at once. Raises BackendError where its weights cannot be read."""
 
     def __init__(self, weights: Path = WEIGHTS) -> None:
-        with np.load(weights) as arrays:
-            widths = tuple(int(width) for width in arrays["widths"])
-            state = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
-        self.net = PlumeNet(widths)
-        self.net.load_state_dict(state)
-        self.net.eval()
+        try:
+            self.net = _read_net(weights)
+        except (OSError, EOFError, BadZipFile, KeyError, ValueError, TypeError, RuntimeError) as error:
+            message = f"{weights} does not hold the weights of this version's prior."
+            raise BackendError("prior_unreadable", message, hint=HINT) from error
 
     def propose(
         self,
@@ -58,7 +59,7 @@ class Prior:
         """
         stand = stand_before(view_at(frame), centre, voxel_size=voxel_size, shape=SHAPE)
         window = look(depth_at, view_at, stand, source, frame, stride=stride, num_frames=num_frames)
-        with torch.no_grad(), _one_thread():
+        with torch.no_grad(), one_thread():
             names = ("images", "matrices", "strides", "conditions", "source")
             sight = Sight(**{name: torch.from_numpy(getattr(window, name))[None] for name in names})
             density, velocity = self.net(sight, SHAPE)[1]
@@ -71,9 +72,22 @@ class Prior:
         )
 
 
+def _read_net(weights: Path) -> PlumeNet:
+    with np.load(weights, allow_pickle=False) as arrays:
+        widths = tuple(int(width) for width in arrays["widths"])
+        state = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
+    net = PlumeNet(widths)
+    net.load_state_dict(state)
+    return net.eval()
+
+
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sums of the network are split by the number of threads: with one, the bytes are the same everywhere."""
+def one_thread() -> Iterator[None]:
+    """Sums of the network are split by the number of threads: with one, the bytes are the same everywhere.
+
+    torch keeps part of that number per thread and part of it for all: who asks from several threads at once holds this
+    around them all, so that none gives the others their threads back.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

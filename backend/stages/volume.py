@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from backend.contract.cameras import Cameras
 from backend.fit.pace import stride_of
@@ -14,8 +16,10 @@ from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.state import VolumeRecord
 from backend.geometry.upright import turned, up_of, upright
-from backend.prior.predict import Prior
+from backend.prior.predict import Prior, one_thread
 from backend.reporting import Report
+
+_MOST_AT_ONCE = 8  # frames; each takes some 100 MB while it is computed
 
 
 def run(
@@ -26,6 +30,7 @@ def run(
     prior: Prior,
     done: Series[VolumeRecord],
     stride: int = 0,  # frames between the images that are compared; 0: found from the motion
+    num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
     """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
 
@@ -38,8 +43,9 @@ def run(
     region = find_region(layers, scene)
     if region is None:
         return
-    for frame in range(len(done), len(layers)):
-        report.progress(frame, len(layers))
+    stride = stride or stride_of(region)
+
+    def proposed(frame: int) -> VolumeRecord:
         proposal = prior.propose(
             lambda number: region.depths[number],
             lambda number: region.views[number],
@@ -47,14 +53,32 @@ def run(
             region.source,
             frame,
             voxel_size=region.voxel_size,
-            stride=stride or stride_of(region),
+            stride=stride,
             num_frames=len(layers),
             seconds_per_frame=scene.seconds_per_frame,
         )
-        yield VolumeRecord(
-            density=proposal.density,
-            velocity=proposal.velocity @ straight[:3, :3].astype(np.float32),
+        density, density_unit = _halved(proposal.density)
+        velocity, velocity_unit = _halved(proposal.velocity @ straight[:3, :3].astype(np.float32))
+        return VolumeRecord(
+            density=density,
+            velocity=velocity,
             from_world=proposal.stand.from_world @ straight,
             voxel_size=np.asarray(region.voxel_size),
+            density_unit=density_unit,
+            velocity_unit=velocity_unit,
         )
+
+    at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(len(done), len(layers), at_once):
+            report.progress(first, len(layers))
+            with one_thread():
+                records = list(pool.map(proposed, range(first, min(first + at_once, len(layers)))))
+            yield from records
     report.progress(len(layers), len(layers))
+
+
+def _halved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values as float16 in units of the largest, and that unit [] float64: eleven bits, whatever the size."""
+    unit = float(np.abs(values).max(initial=0.0)) or 1.0
+    return (values / np.float32(unit)).astype(np.float16), np.asarray(unit)

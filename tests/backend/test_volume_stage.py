@@ -85,3 +85,40 @@ def test_it_goes_on_behind_what_is_done(prior: Prior) -> None:
 def test_a_clip_without_smoke_has_no_volumes(prior: Prior) -> None:
     empty = [np.zeros((128, 72, 4), np.float32)] * NUM_FRAMES
     assert list(volume.run(empty, CAMERAS, SilentReport(), prior=prior, done=[])) == []
+
+
+@pytest.mark.parametrize("num_workers", [2, 3, 50])
+def test_frames_at_once_have_the_same_bytes_and_order(prior: Prior, num_workers: int) -> None:
+    threads = torch.get_num_threads()
+    alone = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, num_workers=1))
+    beside = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, num_workers=num_workers))
+    assert len(beside) == NUM_FRAMES
+    for a, b in zip(alone, beside, strict=True):
+        assert all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in ("density", "velocity", "from_world"))
+    assert len({record.density.tobytes() for record in alone}) == NUM_FRAMES
+    assert torch.get_num_threads() == threads
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-7, 1.0, 1e5, 1e30])
+def test_half_precision_does_for_values_of_any_size(size: float) -> None:
+    values = (size * np.random.default_rng(0).normal(0.0, 1.0, (4, 5, 6, 3))).astype(np.float32)
+    halved, unit = volume._halved(values)
+    assert halved.dtype == np.float16
+    np.testing.assert_allclose(halved * np.float32(unit), values, rtol=6e-4, atol=1e-7 * float(unit) * (size > 0))
+    assert volume._halved(values[:0])[0].shape == (0, 5, 6, 3)
+
+
+def test_a_guide_reads_records_in_their_own_units(prior: Prior) -> None:
+    record = next(iter(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2)))
+    assert record.density.dtype == record.velocity.dtype == np.float16
+    whole = replace(
+        record,
+        density=record.density.astype(np.float32) * np.float32(record.density_unit),
+        velocity=record.velocity.astype(np.float32) * np.float32(record.velocity_unit),
+        density_unit=np.asarray(1.0),
+        velocity_unit=np.asarray(1.0),
+    )
+    points = np.random.default_rng(0).normal((0.5, 0.0, 8.0), 2.0, (300, 3))
+    assert Guide(whole).density_at(points).max() > 0.0
+    np.testing.assert_array_equal(Guide(record).density_at(points), Guide(whole).density_at(points))
+    np.testing.assert_array_equal(Guide(record).velocity_at(points), Guide(whole).velocity_at(points))

@@ -14,6 +14,7 @@ import pytest
 from tools import package
 
 CHECKOUT = Path(package.__file__).resolve().parents[1]
+WEIGHTS = "backend/prior/plumes.npz"  # of the trained prior
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,18 @@ def test_it_holds_what_it_needs_and_nothing_else(archive):
     assert {name.partition("/")[0] for name in inside} == {"__init__.py", "blender_manifest.toml", "LICENSE", "addon", "backend"}
     unwanted = re.compile(r"(^|/)(tests?|docs|synthetic|benchmarks|tools|__pycache__|\..*|ruff\.toml|.*\.(pyc|part|md))(/|$)")
     assert not [name for name in inside if unwanted.search(name)]
-    assert archive.stat().st_size < 5e6
+    with zipfile.ZipFile(archive) as opened:
+        sizes = {entry.filename: entry.compress_size for entry in opened.infolist()}
+    assert sizes.pop(WEIGHTS, 0) < 10.5e6
+    assert sum(sizes.values()) < 5e6
+
+
+def test_it_carries_the_weights_of_the_prior(archive, tmp_path):
+    with zipfile.ZipFile(archive) as opened:
+        opened.extractall(tmp_path / "tree")
+    (tmp_path / "tree" / WEIGHTS).write_bytes(b"some weights")
+    with zipfile.ZipFile(package.build(tmp_path / "tree", tmp_path)) as opened:
+        assert opened.read(WEIGHTS) == b"some weights"
 
 
 def test_the_same_files_give_the_same_bytes(archive, tmp_path):
