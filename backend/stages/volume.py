@@ -19,7 +19,7 @@ from backend.geometry.upright import turned, up_of, upright
 from backend.prior.predict import Prior, one_thread
 from backend.reporting import Report
 
-_MOST_AT_ONCE = 8  # frames; each takes some 100 MB while it is computed
+_MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 
 
 def run(
