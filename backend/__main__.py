@@ -15,6 +15,9 @@ Exit codes: 0 done or cancelled, 2 you can act (one sentence on what is wrong, o
 
 from __future__ import annotations
 
+from backend import kernel_setup  # noqa: F401 before numpy and numba load, see there
+
+# isort: split
 import argparse
 import logging
 import os

@@ -25,6 +25,7 @@ from backend.prior.window import NUM_CONDITIONS, OFFSETS
 from backend.score.measures import correlation
 
 _HELD_BACK = 10  # every such plume
+_SCORED = 4  # every such lesson of those held back
 _SLOW = 0.2  # voxels a stride: motion that need not be known better than that
 _BATCH = 8
 
@@ -80,8 +81,8 @@ def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
     net.eval()
     rows: list[list[float]] = []
     with torch.no_grad():
-        for start in range(0, len(lessons), _BATCH):
-            sight, densities, velocities = lessons.batch(torch.arange(start, min(start + _BATCH, len(lessons))), mirrored=False)
+        for part in torch.arange(0, len(lessons), _SCORED).split(_BATCH):
+            sight, densities, velocities = lessons.batch(part, mirrored=False)
             with torch.autocast("cpu", dtype=torch.bfloat16):
                 answers = net(sight, SHAPE)
             for index in range(len(densities)):

@@ -1,7 +1,8 @@
 """The look of the smoke, frame by frame: Gaussians brought to explain what a view shows.
 
 Masses by expectation-maximisation on the optical depth, held to what was carried along; unexplained smoke is born at
-the prior's depth; then gradient steps on colour and opacity.
+the prior's depth; then gradient steps on colour and opacity. Where a volume is proposed, the particles first go a share
+of the way to its density.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import numpy as np
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
 from backend.fit.depths import Depths
+from backend.fit.follow import Balance, points_on_rays
+from backend.fit.guide import Guide
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
@@ -29,6 +32,8 @@ FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones m
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel
+FOLLOW_PLACES = 0.3  # share of the flow that turns the particles' density into the volume's
+FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm)
 
 
 class Appearance:
@@ -73,8 +78,13 @@ class Appearance:
         """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
-        record = self._calmed(record, layer, view, self.depths.prior(frame))
         kept = config.consistency if consistency is None else consistency
+        guide = self.depths.guide(frame)
+        if guide is not None:
+            record = self._moved_into(record, guide)
+        record = self._calmed(record, layer, view, self.depths.prior(frame))
+        if guide is not None:
+            record = self._weighed_by(record, guide)
         record = self._weighed(record, frame, target, consistency=kept)
         record = self.with_births(record, frame, target)
         record = self._weighed(record, frame, target, consistency=0.0)
@@ -94,15 +104,28 @@ class Appearance:
         masses = record.optical_masses.astype(np.float64)
         common = float(np.exp(np.mean(np.log(np.maximum(masses, 1e-3 * self.unit_mass)))))
         calmed = masses ** (1.0 - CALM_MASS) * common**CALM_MASS
-        pixels, _ = view.project(record.positions)
-        columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
-        rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
+        rows, columns = _pixels_of(record.positions, view)
         seen, opacity = layer[rows, columns, :3], layer[rows, columns, 3:]
         shown = seen / np.maximum(opacity, 0.02)
         share = CALM_COLOR * (opacity > 0.05)
         colors = (1.0 - share) * record.colors + share * shown
         positions = depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH)
         return replace(record, positions=positions, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
+
+    def _moved_into(self, record: VisualRecord, guide: Guide) -> VisualRecord:
+        """Positions on their way to the volume's density."""
+        if len(record.positions) == 0:
+            return record
+        balance = Balance(guide, record.positions, record.optical_masses.astype(np.float64))
+        return replace(record, positions=record.positions + FOLLOW_PLACES * balance.displacement())
+
+    def _weighed_by(self, record: VisualRecord, guide: Guide) -> VisualRecord:
+        """Masses on their way to the volume's density."""
+        if len(record.positions) == 0:
+            return record
+        masses = record.optical_masses.astype(np.float64)
+        masses = masses * Balance(guide, record.positions, masses).ratios() ** FOLLOW_MASSES
+        return replace(record, optical_masses=masses.astype(np.float32))
 
     def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
         """Masses after the frame was seen, without the spent and the departed."""
@@ -118,9 +141,13 @@ class Appearance:
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 
-    def _with_room(self, record: VisualRecord, wanted: int) -> VisualRecord:
-        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting."""
-        lacking = wanted - (self.config.num_particles - len(record.positions))
+    def _with_room(self, record: VisualRecord, wanted: int) -> tuple[VisualRecord, int]:
+        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting. And how
+        many there is room for now."""
+        kept = self._without_faint(record, wanted - (self.config.num_particles - len(record.positions)))
+        return kept, min(wanted, self.config.num_particles - len(kept.positions))
+
+    def _without_faint(self, record: VisualRecord, lacking: int) -> VisualRecord:
         if lacking <= 0:
             return record
         order = np.argsort(record.optical_masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(record.positions)))]
@@ -131,7 +158,7 @@ class Appearance:
 
     def with_births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
         """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
-        view, layer = self.scene.views[frame], self.layers[frame]
+        view = self.scene.views[frame]
         splat = renderer.forward(as_gaussians(record), view)
         missing = explain.missing_depth(splat, target)
         missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
@@ -139,24 +166,37 @@ class Appearance:
         mass = missing * pixel_mass(view, prior.center_depth)
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))
-        wanted = int(total / unit)
-        record = self._with_room(record, wanted)
-        count = min(wanted, self.config.num_particles - len(record.positions))
-        points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=self.seed + 104729 * frame + 1)
-        if len(points) == 0:
-            return record
-        rows, columns = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
-        seen = layer[rows, columns]
-        colors = seen[:, :3] / np.maximum(seen[:, 3:], 0.02)
+        record, count = self._with_room(record, int(total / unit))
+        seed = self.seed + 104729 * frame + 1
+        points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=seed)
+        guide = self.depths.guide(frame)
+        if guide is not None:
+            points = points_on_rays(guide, view, pixels, points, seed=seed)
+        return self._with_newborn(record, points, total, frame)
+
+    def _with_newborn(self, record: VisualRecord, points: np.ndarray, total: float, frame: int) -> VisualRecord:
+        """The record with Gaussians at points [N, 3] m that share the mass `total` m^2, in the colours that the frame shows."""
         count = len(points)
+        if count == 0:
+            return record
+        view, layer = self.scene.views[frame], self.layers[frame]
+        rows, columns = _pixels_of(points, view)
+        seen = layer[rows, columns]
         newborn = {
             "positions": points,
             "velocities": np.zeros((count, 3)),
             "scales": np.full((count, *record.scales.shape[1:]), self.scale),
             "optical_masses": np.full(count, total / count),
-            "colors": colors,
+            "colors": seen[:, :3] / np.maximum(seen[:, 3:], 0.02),
             "born": np.full(count, frame),
         }
         if record.rotations is not None:
             newborn["rotations"] = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         return join(record, **newborn)
+
+
+def _pixels_of(positions: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column [N] of the pixel in which a position is seen, or that of the border next to it."""
+    pixels, _ = view.project(positions)
+    columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
+    return np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1), columns

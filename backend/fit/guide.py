@@ -1,5 +1,4 @@
-"""A proposed volume as a guide for particles: how dense the smoke is at a point, how it moves there, where on a ray it lies,
-and how much of it the particles still lack."""
+"""A proposed volume as a guide for particles: how dense the smoke is at a point, how it moves there, where on a ray it lies."""
 
 from __future__ import annotations
 
@@ -15,8 +14,8 @@ from backend.prior.window import Stand
 
 _SAMPLES = 48  # along a ray
 _HALF_OVER_SPREAD = 6.0**0.5  # of the profile (1 - s^2)^1.5 on -1..1
-_BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
-_FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
+_BESIDE = 9  # pixels around smoke whose rays are asked too
+_FAINT = 0.02  # of the largest sum along a ray: rays with less pass no smoke
 
 
 class Guide:
@@ -51,13 +50,18 @@ class Guide:
         height, width = solid.center_depth.shape
         scale = min(1.0, MAX_SIDE / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
-        depths = self._depths(view)
-        columns, rows = np.meshgrid((np.arange(size[0]) + 0.5) / size[0] * width, (np.arange(size[1]) + 0.5) / size[1] * height)
-        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        depths = self.depths(view)
+        near = cv2.dilate(solid.is_smoke.astype(np.uint8), np.ones((_BESIDE, _BESIDE), np.uint8))
+        rows, columns = np.nonzero(cv2.resize(near, size, interpolation=cv2.INTER_AREA))
+        pixels = np.stack([(columns + 0.5) / size[0] * width, (rows + 0.5) / size[1] * height], axis=1)
         points = view.unproject(np.repeat(pixels, _SAMPLES, axis=0), np.tile(depths, len(pixels)))
-        density = self.density_at(points).reshape(*columns.shape, _SAMPLES).astype(np.float64)
-        moments = [cv2.GaussianBlur((density * depths**power).sum(axis=2), (0, 0), 1.0) for power in range(3)]
-        is_known = moments[0] > _FLOOR * max(float(moments[0].max(initial=0.0)), 1e-12)
+        density = self.density_at(points).reshape(len(pixels), _SAMPLES).astype(np.float64)
+        moments = []
+        for power in range(3):
+            moment = np.zeros(size[::-1])
+            moment[rows, columns] = (density * depths**power).sum(axis=1)
+            moments.append(cv2.GaussianBlur(moment, (0, 0), 1.0))
+        is_known = moments[0] > _FAINT * max(float(moments[0].max(initial=0.0)), 1e-12)
         total = np.where(is_known, moments[0], 1.0)
         middle = np.where(is_known, moments[1] / total, 0.0)
         spread = np.sqrt(np.maximum(np.where(is_known, moments[2] / total, 0.0) - middle**2, 0.0))
@@ -71,7 +75,7 @@ class Guide:
             is_smoke=solid.is_smoke,
         )
 
-    def _depths(self, view: View) -> np.ndarray:
+    def depths(self, view: View) -> np.ndarray:
         """[_SAMPLES] m along the optical axis, through the whole grid."""
         middle = view.to_camera(-(self.record.from_world[:3, :3].T @ self.record.from_world[:3, 3])[None])[0, 2]
         reach = 0.5 * self.lattice.voxel_size * float(np.linalg.norm(self.lattice.shape[:2]))
@@ -82,33 +86,6 @@ class Guide:
         """Positions [N, 3] m one frame later: Heun's rule between the velocities of both frames."""
         first = self.velocity_at(positions)
         return positions + 0.5 * seconds * (first + next_guide.velocity_at(positions + seconds * first))
-
-    def lack(self, positions: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How many times the mass of each particle [N] the volume asks for, and the density [X, Y, Z] 1/m that is missing."""
-        size = self.lattice.voxel_size
-        carried = _blurred(deposited(self.places(positions), masses, self.lattice.shape) / size**3)
-        wanted = _blurred(self.density)
-        floor = _FLOOR * max(float(wanted.max(initial=0.0)), 1e-12)
-        ratio = (wanted + floor) / (carried + floor)
-        return _looked_up(ratio, self.places(positions), "nearest"), np.maximum(wanted - carried, 0.0)
-
-
-def deposited(places: np.ndarray, masses: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Masses [N] shared among the eight voxels around their places [3, N] -> [X, Y, Z] float64; what is outside is lost."""
-    low = np.floor(places).astype(np.int64)
-    share = places - low
-    total = np.zeros(int(np.prod(shape)))
-    for corner in np.ndindex(2, 2, 2):
-        index = low + np.array(corner)[:, None]
-        weight = np.prod(np.where(np.array(corner)[:, None] == 1, share, 1 - share), axis=0) * masses
-        inside = ((index >= 0) & (index < np.array(shape)[:, None])).all(axis=0)
-        flat = np.ravel_multi_index(tuple(index[:, inside]), shape)
-        total += np.bincount(flat, weight[inside], minlength=total.size)
-    return total.reshape(shape)
-
-
-def _blurred(values: np.ndarray) -> np.ndarray:
-    return ndimage.gaussian_filter(np.asarray(values, np.float32), _BLUR, mode="constant")
 
 
 def _looked_up(values: np.ndarray, places: np.ndarray, mode: str) -> np.ndarray:

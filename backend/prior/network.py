@@ -2,7 +2,8 @@
 
 The first sees, in every voxel, what each image shows there. It guesses velocities; along them the smoke of each voxel is
 followed through the window, and the second sees what each image shows where that smoke then was: of smoke that is followed
-rightly, all images speak alike, from all angles. The path is differentiable, so the first learns what serves the second.
+rightly, all images speak alike, from all angles. What the second learns does not reach the first through the paths: that
+doubled the time of a lesson.
 
 Density is the optical depth that the frame itself shows, times a positive share per voxel along the ray: what the image
 says of a ray's total is never learned, only how it spreads. The nets work on blocks of 2 x 2 x 2 voxels, whose values are
@@ -84,7 +85,7 @@ class PlumeNet(nn.Module):
     """Sight -> of the first net and of the second: density [B, X, Y, Z] in scale/voxel, velocity [B, 3, X, Y, Z] in voxels a
     stride. shape: X, Y and Z, multiples of 8 with three widths."""
 
-    def __init__(self, widths: tuple[int, ...] = (64, 88, 112)) -> None:
+    def __init__(self, widths: tuple[int, ...] = (64, 96, 96)) -> None:
         super().__init__()
         self.widths = widths
         self.first = UNet(len(OFFSETS) + 3, widths)
@@ -99,7 +100,8 @@ class PlumeNet(nn.Module):
         now = standing[:, _NOW]
         places = ((voxels - sight.source[:, None, None, None]) / 10).permute(0, 4, 1, 2, 3)
         guess = _density_and_velocity(self.first(torch.cat([standing, places], dim=1), sight.conditions), now)
-        followed = seen_at(sight.images, sight.matrices, follow(guess[1], voxels, sight.strides))
+        with torch.no_grad():
+            followed = seen_at(sight.images, sight.matrices, follow(guess[1], voxels, sight.strides))
         beside = [followed, standing[:, _BESIDE], guess[0][:, None], guess[1], places]
         found = self.second(torch.cat(beside, dim=1), sight.conditions)
         density, change = _density_and_velocity(found, now)
@@ -112,9 +114,8 @@ def seen_at(images: Tensor, matrices: Tensor, voxels: Tensor) -> Tensor:
     shape = voxels.shape[2:5]
     flat = voxels.reshape(batch * count, -1, 3)
     seen = flat @ matrices[..., :3].reshape(-1, 3, 3).transpose(1, 2) + matrices[..., 3].reshape(-1, 1, 3)
-    pixels = seen[..., :2] / seen[..., 2:].clamp_min(1e-3)
     size = torch.tensor([width, height], dtype=torch.float32, device=images.device)
-    grid = (2 * pixels + 1) / size - 1
+    grid = seen[..., :2] * (2 / size) * seen[..., 2:].clamp_min(1e-3).reciprocal() + (1 / size - 1)
     found = functional.grid_sample(images.reshape(-1, 1, height, width), grid[:, None], align_corners=False)
     return found.reshape(batch, count, *shape)
 
@@ -122,12 +123,13 @@ def seen_at(images: Tensor, matrices: Tensor, voxels: Tensor) -> Tensor:
 def follow(velocity: Tensor, voxels: Tensor, strides: Tensor) -> Tensor:
     """Where the smoke of each voxel is at each image, if the velocity [B, 3, X, Y, Z] voxels a stride stands still.
 
-    From image to image by one Euler step -> [B, O, X, Y, Z, 3] voxels.
+    From image to image by one Euler step, for blocks of 2 x 2 x 2 voxels and linearly between -> [B, O, X, Y, Z, 3] voxels.
     """
-    size = torch.tensor(voxels.shape[:3], dtype=torch.float32, device=velocity.device)
-    step_at = velocity.clamp(-_LARGEST_STEP, _LARGEST_STEP)
-    start = voxels.expand(len(velocity), *voxels.shape)
-    found: list[Tensor] = [start] * len(OFFSETS)
+    shape = voxels.shape[:3]
+    size = torch.tensor(shape, dtype=torch.float32, device=velocity.device)
+    step_at = functional.avg_pool3d(velocity.float().clamp(-_LARGEST_STEP, _LARGEST_STEP), 2)
+    start = voxels[::2, ::2, ::2].expand(len(velocity), *step_at.shape[2:], 3) + 0.5
+    found: list[Tensor] = [torch.zeros_like(start)] * len(OFFSETS)
     for way in (-1, 1):
         at, index = start, _NOW
         while 0 <= index + way < len(OFFSETS):
@@ -136,8 +138,10 @@ def follow(velocity: Tensor, voxels: Tensor, strides: Tensor) -> Tensor:
             span = (strides[:, index + way] - strides[:, index])[:, None, None, None, None]
             index += way
             at = at + span * speed.permute(0, 2, 3, 4, 1)
-            found[index] = at
-    return torch.stack(found, dim=1)
+            found[index] = at - start
+    ways = torch.stack(found, dim=1).flatten(0, 1).permute(0, 4, 1, 2, 3).contiguous()
+    ways = functional.interpolate(ways, scale_factor=2, mode="trilinear", align_corners=False)
+    return voxels + ways.permute(0, 2, 3, 4, 1).reshape(len(velocity), len(OFFSETS), *shape, 3)
 
 
 def _density_and_velocity(out: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,16 +10,21 @@ import numpy as np
 import torch
 
 from backend.contract.cameras import Cameras
+from backend.field.rays import at_voxels, optical_depth
 from backend.fit.pace import stride_of
 from backend.fit.region import find_region
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.state import VolumeRecord
+from backend.geometry.camera import View
 from backend.geometry.upright import turned, up_of, upright
-from backend.prior.predict import Prior, one_thread
+from backend.prior.predict import Prior, Proposal, one_thread
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
+_UPDATES = 2  # towards the frame's own optical depth
+_FLOOR = 0.01  # optical depth added to both sides of a ratio
+_MOST_RATIO = 4.0
 
 
 def run(
@@ -45,8 +50,8 @@ def run(
         return
     stride = stride or stride_of(region)
 
-    def proposed(frame: int) -> VolumeRecord:
-        proposal = prior.propose(
+    def proposed(frame: int) -> Proposal:
+        return prior.propose(
             lambda number: region.depths[number],
             lambda number: region.views[number],
             region.centre,
@@ -57,7 +62,9 @@ def run(
             num_frames=len(layers),
             seconds_per_frame=scene.seconds_per_frame,
         )
-        density, density_unit = _halved(proposal.density)
+
+    def recorded(proposal: Proposal, frame: int) -> VolumeRecord:
+        density, density_unit = _halved(agreed(proposal, region.depths[frame], region.views[frame]))
         velocity, velocity_unit = _halved(proposal.velocity @ straight[:3, :3].astype(np.float32))
         return VolumeRecord(
             density=density,
@@ -73,9 +80,21 @@ def run(
         for first in range(len(done), len(layers), at_once):
             report.progress(first, len(layers))
             with one_thread():
-                records = list(pool.map(proposed, range(first, min(first + at_once, len(layers)))))
-            yield from records
+                proposals = list(pool.map(proposed, range(first, min(first + at_once, len(layers)))))
+            for frame, proposal in enumerate(proposals, start=first):
+                yield recorded(proposal, frame)
     report.progress(len(layers), len(layers))
+
+
+def agreed(proposal: Proposal, depth: np.ndarray, view: View) -> np.ndarray:
+    """The proposal's density [X, Y, Z] 1/m with the optical depth [h, w] that the frame shows in `view`: a few multiplicative
+    updates along the rays (Gordon 1970)."""
+    lattice, own, density = proposal.stand.lattice, proposal.stand.seen(view), proposal.density
+    for _ in range(_UPDATES):
+        ratio = (depth + _FLOOR) / (optical_depth(density, lattice, own) + _FLOOR)
+        ratio = np.clip(ratio, 1.0 / _MOST_RATIO, _MOST_RATIO).astype(np.float32)
+        density = density * at_voxels(ratio, lattice, own, outside=1.0)
+    return density
 
 
 def _halved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

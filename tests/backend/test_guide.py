@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
 from backend.fit.depth_prior import inflate, sample_points
-from backend.fit.guide import Guide, deposited
+from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.window import stand_before
@@ -76,32 +75,3 @@ def test_what_it_carries_turns_with_the_flow() -> None:
     for _ in range(60):
         points = guide.carried(points, guide, seconds=1 / 60)
     np.testing.assert_allclose(points[0], MIDDLE + np.array([0.0, 2.0, 1.0]), atol=5e-3)
-
-
-def test_masses_are_shared_and_kept() -> None:
-    rng = np.random.default_rng(1)
-    places = rng.uniform(0.0, 7.0, (3, 500))
-    masses = rng.random(500)
-    total = deposited(places, masses, (8, 8, 8))
-    assert total.sum() == pytest.approx(masses.sum())
-    middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
-    np.testing.assert_allclose(middle, (places * masses).sum(axis=1) / masses.sum(), atol=1e-9)
-    assert deposited(np.full((3, 1), 40.0), np.ones(1), (8, 8, 8)).sum() == 0.0
-
-
-def test_it_asks_for_what_particles_lack() -> None:
-    density = blob(MIDDLE)
-    guide = Guide(record(density))
-    rng = np.random.default_rng(2)
-    mass = density.sum() * 0.5**3
-    points = MIDDLE + rng.normal(0, 1.2, (40_000, 3))
-    ratio, missing = guide.lack(points, np.full(40_000, mass / 40_000))
-    inside = np.linalg.norm(points - MIDDLE, axis=1) < 2.0
-    assert abs(np.median(ratio[inside]) - 1.0) < 0.05
-    assert missing.sum() * 0.5**3 < 0.06 * mass
-    ratio, missing = guide.lack(points, np.full(40_000, 0.5 * mass / 40_000))
-    assert abs(np.median(ratio[inside]) - 1.9) < 0.15
-    assert abs(missing.sum() * 0.5**3 / mass - 0.5) < 0.05
-    ratio, missing = guide.lack(np.zeros((0, 3)), np.zeros(0))
-    assert len(ratio) == 0
-    assert missing.sum() * 0.5**3 == pytest.approx(mass, rel=0.02)

@@ -1,0 +1,115 @@
+"""Particles that follow a volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backend.fit.follow import MOST_RATIO, Balance, deposited, points_on_rays, weighted_poisson
+from backend.fit.guide import Guide
+from backend.fit.state import VolumeRecord
+from backend.geometry.camera import view_at
+from backend.prior.window import stand_before
+from synthetic.sweep import Orbit, orbit_cameras
+
+VIEW = view_at(orbit_cameras(Orbit(), width=180, height=320, fps=15.0, num_frames=135), 40)
+MIDDLE = np.array([0.5, -0.3, 8.0])
+STAND = stand_before(VIEW, MIDDLE, voxel_size=0.5, shape=(24, 24, 40))
+VOLUME = 0.5**3
+
+
+def guide_of(centre: np.ndarray, size: float = 1.2) -> Guide:
+    local = STAND.lattice.centres()
+    places = (local - STAND.from_world[:3, 3]) @ STAND.from_world[:3, :3]
+    density = np.exp(-0.5 * np.square((places - centre) / size).sum(axis=-1))
+    velocity = np.zeros((*density.shape, 3), np.float32)
+    return Guide(
+        VolumeRecord(
+            density=density.astype(np.float32), velocity=velocity, from_world=STAND.from_world, voxel_size=np.asarray(0.5)
+        )
+    )
+
+
+def cloud(centre: np.ndarray, size: float, count: int = 40_000) -> np.ndarray:
+    return centre + np.random.default_rng(2).normal(0, size, (count, 3))
+
+
+def test_masses_are_shared_and_kept() -> None:
+    rng = np.random.default_rng(1)
+    places = rng.uniform(0.0, 7.0, (3, 500))
+    masses = rng.random(500)
+    total = deposited(places, masses, (8, 8, 8))
+    assert total.sum() == pytest.approx(masses.sum())
+    middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
+    np.testing.assert_allclose(middle, (places * masses).sum(axis=1) / masses.sum(), atol=1e-9)
+    assert deposited(np.full((3, 1), 40.0), np.ones(1), (8, 8, 8)).sum() == 0.0
+
+
+def test_the_volume_asks_for_what_particles_lack() -> None:
+    guide = guide_of(MIDDLE)
+    mass = float(guide.density.sum()) * VOLUME
+    points = cloud(MIDDLE, 1.2)
+    inside = np.linalg.norm(points - MIDDLE, axis=1) < 2.0
+    enough = Balance(guide, points, np.full(40_000, mass / 40_000))
+    assert abs(np.median(enough.ratios()[inside]) - 1.0) < 0.05
+    half = Balance(guide, points, np.full(40_000, 0.5 * mass / 40_000))
+    assert abs(np.median(half.ratios()[inside]) - 1.9) < 0.15
+    assert Balance(guide, points, np.full(40_000, mass)).ratios().min() == pytest.approx(1 / MOST_RATIO)
+    none = Balance(guide, np.zeros((0, 3)), np.zeros(0))
+    assert len(none.ratios()) == len(none.displacement()) == 0
+
+
+@pytest.mark.parametrize("shift", [(0.6, 0.0, 0.0), (0.0, -0.6, 0.0), (0.0, 0.0, 0.6), (0.4, 0.4, -0.4)])
+def test_particles_flow_to_where_the_volume_is(shift: tuple[float, float, float]) -> None:
+    """A cloud beside its volume: the mean displacement is the shift, in the world's axes; again and again it arrives."""
+    guide = guide_of(MIDDLE + shift)
+    points = cloud(MIDDLE, 1.2)
+    masses = np.full(len(points), 1.0 / len(points))
+    first = Balance(guide, points, masses).displacement()
+    assert np.linalg.norm(first.mean(axis=0) - shift) < 0.4 * np.linalg.norm(shift)
+    assert np.linalg.norm(first, axis=1).max() <= 0.5 + 1e-6
+    for _ in range(8):
+        points = points + 0.5 * Balance(guide, points, masses).displacement()
+    assert np.linalg.norm(points.mean(axis=0) - MIDDLE - shift) < 0.1 * np.linalg.norm(shift)
+    np.testing.assert_allclose(points.std(axis=0), 1.2, atol=0.12)
+
+
+def test_a_cloud_in_its_volume_stays() -> None:
+    points = cloud(MIDDLE, 1.2)
+    moved = Balance(guide_of(MIDDLE), points, np.full(len(points), 3.0)).displacement()
+    assert np.abs(moved.mean(axis=0)).max() < 0.02
+    assert np.median(np.linalg.norm(moved, axis=1)) < 0.08
+
+
+def test_a_weighted_flow_has_the_divergence_that_was_asked_for() -> None:
+    rng = np.random.default_rng(4)
+    weight = rng.uniform(0.2, 2.0, (9, 8, 7))
+    potential = rng.normal(size=(9, 8, 7))
+    wanted = np.zeros_like(weight)
+    for axis in range(3):
+        face = 0.5 * (np.delete(weight, 0, axis) + np.delete(weight, -1, axis))
+        wanted += np.diff(face * np.diff(potential, axis=axis), axis=axis, prepend=0.0, append=0.0)
+    found = weighted_poisson(weight, wanted)
+    error = (found - found.mean()) - (potential - potential.mean())
+    assert np.linalg.norm(error) < 0.1 * np.linalg.norm(potential)
+    assert np.abs(weighted_poisson(weight, np.zeros_like(weight))).max() == 0.0
+
+
+def test_no_smoke_moves_nobody() -> None:
+    guide = guide_of(MIDDLE + 1000.0)
+    points = cloud(MIDDLE, 1.2, 50)
+    assert np.abs(Balance(guide, points, np.ones(50)).displacement()).max() == 0.0
+
+
+def test_points_on_rays_take_the_volumes_depth() -> None:
+    guide = guide_of(MIDDLE, 0.9)
+    pixel, depth = VIEW.project(MIDDLE[None])
+    pixels = np.repeat(pixel, 4000, axis=0)
+    points = points_on_rays(guide, VIEW, pixels, np.zeros((4000, 3)), seed=3)
+    again, depths = VIEW.project(points)
+    np.testing.assert_allclose(again, pixels, atol=1e-6)
+    assert abs(depths.mean() - depth[0]) < 0.03
+    assert abs(depths.std() - 0.9) < 0.05
+    corner = points_on_rays(guide, VIEW, np.zeros((1, 2)), np.full((1, 3), 7.0), seed=3)
+    np.testing.assert_array_equal(corner, np.full((1, 3), 7.0))
+    assert points_on_rays(guide, VIEW, np.zeros((0, 2)), np.zeros((0, 3)), seed=3).shape == (0, 3)
