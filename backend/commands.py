@@ -178,22 +178,12 @@ def simulate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
 
 def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
     """A finished job against the truth of a benchmark scene, beside what trivial answers get. JSON, and a table."""
-    from backend.fit.scene import make_scene
     from backend.io.atomic import whole_file
-    from backend.io.frame_stack import FrameStack
-    from backend.io.particles import read_particles
-    from backend.io.records import open_stage_file
-    from backend.score.evaluate import evaluate as scored
     from backend.score.evaluate import table
-    from backend.score.particles import ParticlePrediction
+    from backend.score.finished_job import score_job
     from backend.score.truth_set import read_truth_set
 
-    folder, truth = JobFolder(options.job), read_truth_set(options.truth)
-    read_result(options.job)  # says it where the job is not finished
-    with open_stage_file(folder.smoke) as file:
-        anchor = make_scene(FrameStack(file, "smoke"), read_cameras(folder.cameras)).anchor
-    with read_particles(folder.particles) as particles:
-        scores = scored(ParticlePrediction(particles), truth, anchor=anchor)
+    scores = score_job(JobFolder(options.job), read_truth_set(options.truth))
     print(table(scores))
     if options.out is not None:
         with whole_file(options.out) as part:

@@ -1,5 +1,5 @@
-"""A reconstruction against the truth: views it never saw, frames it never saw, the volume, the velocity, and what trivial
-answers get on the same pictures.
+"""A reconstruction against the truth: views it never saw, frames it never saw, the volume, the velocity; beside it what
+trivial answers get on the same pictures, and the volumes of a prior that treats every frame by itself.
 
 Means of decibels are over frames, each at most 50 dB; `global_db` is that of the mean squared error of all of them.
 """
@@ -18,9 +18,18 @@ from backend.score import baselines, measures
 from backend.score.truth_set import TruthSet, Volume
 
 THIRDS = ("first", "middle", "last")
+FUTURE_VIEWS = (INPUT_VIEW, "nvs")
 
 
-class Prediction(Protocol):
+class Volumes(Protocol):
+    """Volumes that are scored, by video frame."""
+
+    def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Density [X, Y, Z] 1/m and velocity [X, Y, Z, 3] m/s on the voxels of `like`."""
+        ...
+
+
+class Prediction(Volumes, Protocol):
     """What is scored. Frames are video frames; those from num_seen on are a forecast."""
 
     num_frames: int
@@ -29,9 +38,8 @@ class Prediction(Protocol):
         """[H, W, 4] linear premultiplied light and opacity."""
         ...
 
-    def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Density [X, Y, Z] 1/m and velocity [X, Y, Z, 3] m/s on the voxels of `like`."""
-        ...
+
+Answer = Callable[[int], np.ndarray]  # video frame -> [H, W, 4]
 
 
 @dataclass
@@ -49,28 +57,48 @@ class _Errors:
         self.smoke.append(smoke)
 
     def summary(self, num_seen: int) -> dict[str, Any]:
+        """Means over all frames, and over each third of num_seen frames; 0: they are none of these."""
         full = [measures.decibels(error) for error in self.full]
         smoke = [measures.decibels(error) for error in self.smoke if not np.isnan(error)]
         found: dict[str, Any] = {"full_db": _mean(full), "global_db": _rounded(measures.decibels(float(np.mean(self.full))))}
         found["smoke_db"] = _mean(smoke)
-        for third, name in enumerate(THIRDS):
-            part = [value for frame, value in zip(self.frames, full, strict=True) if 3 * frame // max(num_seen, 1) == third]
+        for third, name in enumerate(THIRDS if num_seen else ()):
+            part = [value for frame, value in zip(self.frames, full, strict=True) if 3 * frame // num_seen == third]
             found[f"{name}_db"] = _mean(part)
         found["by_frame_db"] = {str(frame): _rounded(value) for frame, value in zip(self.frames, full, strict=True)}
         return found
 
 
-def evaluate(prediction: Prediction, truth: TruthSet, *, anchor: np.ndarray) -> dict[str, Any]:
-    """All scores of one reconstruction; anchor [3] m: where billboards stand. Nothing is rounded before it is averaged."""
-    seen_pictures = truth.pictures(INPUT_VIEW)
-    scores: dict[str, Any] = {"scene": truth.name, "input": _input_view(prediction, truth, seen_pictures)}
-    for view in truth.frames:
-        if view != INPUT_VIEW:
-            scores[view] = _other_view(prediction, truth, view, seen_pictures, anchor)
-    if prediction.num_frames > truth.num_seen:
-        scores["future_input"] = _future(prediction, truth, INPUT_VIEW, seen_pictures)
-        scores["future_nvs"] = _future(prediction, truth, "nvs", seen_pictures)
+def evaluate(
+    prediction: Prediction,
+    truth: TruthSet,
+    *,
+    anchor: np.ndarray,  # [3] m: where billboards stand
+    prior: Volumes | None = None,
+) -> dict[str, Any]:
+    """All scores of one reconstruction. Nothing is rounded before it is averaged."""
+    seen = truth.pictures(INPUT_VIEW)
+    scores: dict[str, Any] = {"scene": truth.name}
+    future: dict[str, Any] = {}
+    for view, frames in truth.frames.items():
+        targets = dict(zip(frames, seen if view == INPUT_VIEW else truth.pictures(view), strict=True))
+        asked = [frame for frame in frames if frame < prediction.num_frames]
+        shown = {frame: prediction.picture(truth.view(view, frame), frame) for frame in asked}
+        past = [frame for frame in asked if frame < truth.num_seen]
+        ahead = [frame for frame in asked if frame >= truth.num_seen]
+        still = np.mean([shown[frame] for frame in past], axis=0)
+        ours: dict[str, Answer] = {"ours": shown.__getitem__, "still mean": lambda frame, still=still: still}
+        answers = ours | _trivial(truth, view, seen, anchor)
+        if view == INPUT_VIEW:  # where a copy is the truth itself
+            answers = {name: answers[name] for name in ("ours", "black", "grey")}
+        scores[view] = {name: _errors(answer, past, targets).summary(truth.num_seen) for name, answer in answers.items()}
+        if ahead and view in FUTURE_VIEWS:
+            answers = ours | _frozen(prediction, truth, view, seen, anchor)
+            future[f"future_{view}"] = {name: _errors(answer, ahead, targets).summary(0) for name, answer in answers.items()}
+    scores |= future
     scores["volume"] = _volumes(prediction, truth)
+    if prior is not None:
+        scores["prior_volume"] = _volumes(prior, truth)
     return scores
 
 
@@ -81,81 +109,49 @@ def table(scores: dict[str, Any]) -> str:
     ]
     keys = ("full_db", "smoke_db", "first_db", "middle_db", "last_db", "global_db")
     for view, answers in scores.items():
-        if not isinstance(answers, dict) or view == "volume":
+        if not (isinstance(answers, dict) and "ours" in answers):
             continue
         for answer, found in answers.items():
             numbers = [found.get(key) for key in keys]
             cells = ["-" if number is None else f"{number:.2f}" for number in numbers]
             lines.append(f"{view:<14} {answer:<22} {cells[0]:>8} " + " ".join(f"{cell:>7}" for cell in cells[1:]))
-    volume = scores["volume"]
-    lines += [f"volume         {name} {volume[name]}" for name in ("correlation", "relative_l2", "mass_ratio") if name in volume]
-    lines += [f"velocity       {name} {value}" for name, value in volume.get("velocity", {}).items()]
+    for name in ("volume", "prior_volume", "divergence", "buoyancy"):
+        found = scores.get(name, {})
+        figures = {key: value for key, value in found.items() if key != "velocity"} | found.get("velocity", {})
+        lines += [f"{name:<14} {key} {value}" for key, value in figures.items()]
     return "\n".join(lines)
 
 
-def best_trivial(scores: dict[str, dict[str, Any]], figure: str) -> tuple[str, float]:
-    """Name and value of the trivial answer that has most of a figure."""
-    names = [name for name in scores if name != "ours" and scores[name].get(figure) is not None]
-    best = max(names, key=lambda name: scores[name][figure])
-    return best, float(scores[best][figure])
+def _trivial(truth: TruthSet, view: str, seen: np.ndarray, anchor: np.ndarray) -> dict[str, Answer]:
+    """What needs no reconstruction, from the input picture of the same moment."""
+
+    def answer(frame: int, name: str) -> np.ndarray:
+        return baselines.trivial_view(name, seen[frame], truth.view(INPUT_VIEW, frame), truth.view(view, frame), anchor)
+
+    return {name: lambda frame, name=name: answer(frame, name) for name in baselines.TRIVIAL}
 
 
-def _input_view(prediction: Prediction, truth: TruthSet, pictures: np.ndarray) -> dict[str, Any]:
-    ours = _Errors()
-    for frame in range(truth.num_seen):
-        ours.add(frame, prediction.picture(truth.view(INPUT_VIEW, frame), frame), pictures[frame])
-    return {"ours": ours.summary(truth.num_seen)}
-
-
-def _other_view(
-    prediction: Prediction, truth: TruthSet, view: str, seen: np.ndarray, anchor: np.ndarray
-) -> dict[str, dict[str, Any]]:
-    """Of the seen frames. `still mean` is the mean of our own pictures."""
-    frames = [frame for frame in truth.frames[view] if frame < truth.num_seen]
-    targets = truth.pictures(view)
-    ours = [prediction.picture(truth.view(view, frame), frame) for frame in frames]
-    still = np.mean(ours, axis=0)
-    answers: dict[str, Callable[[int, int], np.ndarray]] = {
-        "ours": lambda index, frame: ours[index],
-        "still mean": lambda index, frame: still,
-    }
-    for name in baselines.TRIVIAL:
-
-        def trivial(index: int, frame: int, name: str = name) -> np.ndarray:
-            from_view = truth.view(INPUT_VIEW, frame)
-            return baselines.trivial_view(name, seen[frame], from_view, truth.view(view, frame), anchor)
-
-        answers[name] = trivial
-    return {name: _scored(answer, frames, targets).summary(truth.num_seen) for name, answer in answers.items()}
-
-
-def _future(prediction: Prediction, truth: TruthSet, view: str, seen: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Of the frames after the seen ones. Frozen: the last seen picture, and our picture of the last seen moment."""
+def _frozen(prediction: Prediction, truth: TruthSet, view: str, seen: np.ndarray, anchor: np.ndarray) -> dict[str, Answer]:
+    """What needs no forecast: our last seen moment held still, and trivial answers from the last seen picture."""
     last = truth.num_seen - 1
-    wanted = [frame for frame in truth.frames[view] if truth.num_seen <= frame < prediction.num_frames]
-    targets = truth.pictures(view)
-    first = truth.frames[view].index(wanted[0])
-    answers: dict[str, Callable[[int, int], np.ndarray]] = {
-        "ours": lambda index, frame: prediction.picture(truth.view(view, frame), frame),
-        "frozen reconstruction": lambda index, frame: prediction.picture(truth.view(view, frame), last),
-        "frozen picture": lambda index, frame: seen[last],
-        "black": lambda index, frame: np.zeros_like(seen[last]),
+
+    def answer(frame: int, name: str) -> np.ndarray:
+        return baselines.trivial_view(name, seen[last], truth.view(INPUT_VIEW, last), truth.view(view, frame), anchor)
+
+    names = {name: name if name in ("black", "grey") else f"frozen {name}" for name in baselines.TRIVIAL}
+    return {"frozen reconstruction": lambda frame: prediction.picture(truth.view(view, frame), last)} | {
+        title: lambda frame, name=name: answer(frame, name) for name, title in names.items()
     }
-    found = {name: _scored(answer, wanted, targets[first:]).summary(truth.num_seen) for name, answer in answers.items()}
-    for summary in found.values():
-        for third in THIRDS:
-            summary.pop(f"{third}_db")
-    return found
 
 
-def _scored(answer: Callable[[int, int], np.ndarray], frames: list[int], targets: np.ndarray) -> _Errors:
+def _errors(answer: Answer, frames: list[int], targets: dict[int, np.ndarray]) -> _Errors:
     errors = _Errors()
-    for index, frame in enumerate(frames):
-        errors.add(frame, answer(index, frame), targets[index])
+    for frame in frames:
+        errors.add(frame, answer(frame), targets[frame])
     return errors
 
 
-def _volumes(prediction: Prediction, truth: TruthSet) -> dict[str, Any]:
+def _volumes(prediction: Volumes, truth: TruthSet) -> dict[str, Any]:
     """Means over the seen moments that hold smoke. mass_ratio: our optical mass over the true one, of all moments."""
     rows: list[dict[str, float]] = []
     velocities: list[dict[str, float]] = []

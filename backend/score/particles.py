@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from backend.geometry.camera import View
-from backend.geometry.lattice import Lattice
 from backend.io.particles import Particles
+from backend.physics.divergence import divergence, divergence_as_published
 from backend.render.picture import picture
 from backend.render.voxelize import voxelize
 from backend.score.truth_set import Volume
@@ -24,8 +24,31 @@ class ParticlePrediction:
         return picture(self._particles.frame(frame - self._start), view)
 
     def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        x, y, z = like.density.shape
-        origin = (float(like.origin[0]), float(like.origin[1]), float(like.origin[2]))
-        lattice = Lattice(origin=origin, voxel_size=like.voxel_size, shape=(x, y, z))
-        grids = voxelize(self._particles.frame(frame - self._start), lattice)
+        grids = voxelize(self._particles.frame(frame - self._start), like.lattice)
         return grids["density"], grids["velocity"]
+
+
+def mean_divergence(particles: Particles) -> dict[str, float]:
+    """Mean |div v| over the Gaussians within one smoothing length, 1/s, as published and corrected, and the share of them
+    that the corrected one counts; means over the fitted frames. A figure that no frame gives is left out."""
+    rows: dict[str, list[float]] = {"as_published": [], "corrected": [], "coverage": []}
+    radius = particles.info.fluid["smoothing_length_m"]
+    for index in range(particles.num_frames):
+        frame = particles.frame(index)
+        if frame.count:
+            velocities = frame.velocities.astype(np.float64)
+            rows["as_published"].append(divergence_as_published(frame.positions, velocities, radius).mean_absolute)
+            found = divergence(frame.positions, velocities, radius)
+            rows["corrected"].append(found.mean_absolute)
+            rows["coverage"].append(found.coverage)
+    return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items() if np.isfinite(values).any()}
+
+
+def learned_buoyancy(particles: Particles) -> dict[str, float]:
+    """Its strength, m/s^2, and how far its direction is from the world's up, degrees; no direction without strength."""
+    vector = np.asarray(particles.info.buoyancy, np.float64)
+    strength = float(np.linalg.norm(vector))
+    found = {"strength": round(strength, 4)}
+    if strength > 0.0:
+        found["degrees_from_up"] = round(float(np.degrees(np.arccos(np.clip(vector[2] / strength, -1.0, 1.0)))), 2)
+    return found

@@ -16,6 +16,7 @@ from backend.contract.errors import BackendError
 from backend.contract.result import CAMERAS_FILE
 from backend.contract.truth import FUTURE_VIDEO, INPUT_VIEW, SMOKE_VIDEO, TRUTH_FILE, TRUTH_FOLDER, VOLUMES_FILE, view_folder
 from backend.geometry.camera import View, view_at
+from backend.geometry.lattice import Lattice
 from backend.io.images import decode_srgb
 
 
@@ -28,6 +29,12 @@ class Volume:
     velocity: np.ndarray | None
     voxel_size: float
     origin: np.ndarray
+
+    @property
+    def lattice(self) -> Lattice:
+        x, y, z = (float(start) for start in self.origin)
+        i, j, k = self.density.shape
+        return Lattice(origin=(x, y, z), voxel_size=self.voxel_size, shape=(i, j, k))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

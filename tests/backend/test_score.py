@@ -12,7 +12,8 @@ import pytest
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.score import baselines, measures
-from backend.score.evaluate import best_trivial, camera_axes, evaluate, table
+from backend.score.compare import best_trivial
+from backend.score.evaluate import camera_axes, evaluate, table
 from backend.score.truth_set import Volume, read_truth_set
 
 SHIPPED = Path(__file__).resolve().parents[2] / "synthetic" / "bench"

@@ -1,0 +1,20 @@
+"""Scores beside each other, as `evaluate` writes them. Without numpy, so that pages and runners may read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+OURS = "ours"
+
+
+def best_trivial(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind: str = "") -> tuple[str, float]:
+    """Name and value of the trivial answer that has most of a figure, among those whose names begin with `kind`."""
+    found = {name: figures[figure] for name, figures in answers.items() if name != OURS and name.startswith(kind)}
+    best = max((name for name, value in found.items() if value is not None), key=lambda name: found[name])
+    return best, float(found[best])
+
+
+def lead(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind: str = "") -> float:
+    """How much more ours has of a figure than the best trivial answer, dB."""
+    return float(answers[OURS][figure]) - best_trivial(answers, figure, kind=kind)[1]
