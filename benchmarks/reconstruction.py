@@ -83,7 +83,11 @@ def main(arguments: list[str] | None = None) -> int:
                 except (BackendError, RuntimeError, subprocess.CalledProcessError) as error:  # the others are made all the same
                     print(f"{preset} {method} {scene}: {error}", file=sys.stderr, flush=True)
                     failures += 1
-    results = gather(root)
+    try:
+        results = gather(root)
+    except RuntimeError as error:
+        print(error, file=sys.stderr)
+        return 1
     write_text(root / RESULTS_FILE, as_text(results))
     if given.json:
         write_text(given.json, as_text({**results, "cells": [without_frames(cell) for cell in results["cells"]]}))

@@ -2,8 +2,8 @@
 
     python -m benchmarks.whole_path [--json FILE] [--frames N] [--only demo|large]
 
-The large clip is drawn here: puffs that rise before a textured background, H.264. Peak memory is that of the backend's
-process, as the system counts it (ru_maxrss). Times are those of a machine that may be busy; memory does not depend on it.
+The large clip is drawn here: puffs that rise before a textured background, H.264. Times are those of a machine that may be
+busy; memory does not depend on it.
 """
 
 from __future__ import annotations
@@ -12,22 +12,23 @@ import argparse
 import json
 import os
 import platform
-import subprocess
-import sys
 import tempfile
-import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from fractions import Fraction
+from multiprocessing import get_context
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 
-CHECKOUT = Path(__file__).resolve().parents[1]
+from benchmarks.cost import CHECKOUT, run_backend
+
 DEMO = CHECKOUT / "synthetic" / "samples" / "demo_plume.mp4"
 
 
-def draw_large(path: Path, num_frames: int) -> Path:
+def draw_large(path: Path, num_frames: int) -> None:
     """A 1920x1080 clip, 30 fps."""
     width, height = 1920, 1080
     random = np.random.default_rng(7)
@@ -49,25 +50,12 @@ def draw_large(path: Path, num_frames: int) -> Path:
             image = ((plate * (1 - opacity) + 0.85 * opacity) * 255).astype(np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
-    return path
 
 
 def measure(clip: Path, job: Path, preset: str) -> dict:
     """Run one job in a process of its own and say what it took."""
-    command = [sys.executable, "-m", "backend", "reconstruct", str(clip), "--job", str(job), "--preset", preset]
-    began = time.monotonic()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(CHECKOUT)}, cwd=CHECKOUT)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"reconstruct ended with code {process.returncode}")
-    return {
-        "preset": preset,
-        "seconds": round(time.monotonic() - began, 1),
-        "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 1),
-        "peak_gib": round(usage.ru_maxrss / 1024**2, 2),
-        "stages": json.loads((job / "timing.json").read_text()),
-    }
+    cost = run_backend("reconstruct", clip, "--job", job, "--preset", preset)
+    return {"preset": preset, **asdict(cost)}
 
 
 def main() -> None:
@@ -82,7 +70,11 @@ def main() -> None:
         if options.only != "large":
             figures["demo"] = measure(DEMO, folder / "demo", "preview")
         if options.only != "demo":
-            clip = draw_large(folder / "large.mp4", options.frames)
+            clip = folder / "large.mp4"
+            with ProcessPoolExecutor(
+                1, mp_context=get_context("spawn")
+            ) as another:  # this one stays small, see benchmarks/cost.py
+                another.submit(draw_large, clip, options.frames).result()
             figures["large"] = {"frames": options.frames, **measure(clip, folder / "large", "draft")}
     print(json.dumps(figures, indent=2))
     if options.json:

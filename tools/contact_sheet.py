@@ -46,10 +46,15 @@ def row(scene: Path) -> np.ndarray:
         shown = truth["views"][view]
         index = int(np.argmin(np.abs(np.array(shown) - last)))
         pictures.append(frames(scene / "truth" / view / "smoke.mkv")[index])
+    text = f"{scene.name}: clip at frames 0, {last // 2}, {last}; smoke alone at {last}: input, first place, side, back"
+    return beside(pictures, text)
+
+
+def beside(pictures: list[np.ndarray], text: str) -> np.ndarray:
+    """[H, W, 3] uint8 BGR: pictures of one size, a fourth channel left out, side by side under a line of text."""
     gap = np.zeros((pictures[0].shape[0], _GAP, 3), np.uint8)
     line = np.concatenate([part for picture in pictures for part in (picture[..., :3], gap)], axis=1)
     title = np.full((20, line.shape[1], 3), 30, np.uint8)
-    text = f"{scene.name}: clip at frames 0, {last // 2}, {last}; smoke alone at {last}: input, first place, side, back"
     cv2.putText(title, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
     return np.concatenate([title, line])
 

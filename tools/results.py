@@ -12,9 +12,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tools.reconstruction_page import reconstruction, table
+
 CHECKOUT = Path(__file__).resolve().parent.parent
 FIGURES = CHECKOUT / "docs" / "results"
 PAGE = CHECKOUT / "docs" / "results.md"
+IMAGES = CHECKOUT / "docs" / "images"
 
 
 def main() -> int:
@@ -36,6 +39,7 @@ def page() -> str:
         "# What was measured\n",
         "Made by `python -m tools.results` from `docs/results/*.json`, which the named commands wrote. Times are of one "
         "shared machine with two cores that was not always quiet; ratios and memory depend on that less.\n",
+        *(reconstruction(load("reconstruction"), IMAGES) if has("reconstruction") else []),
         *whole_path(load("whole_path")),
         *input_view(load("view_demo"), load("view_plume"), load("view_wildfire")),
         *forecast(load("forecast_demo"), load("forecast_plume")),
@@ -54,11 +58,6 @@ def has(name: str) -> bool:
 
 def load(name: str) -> dict[str, Any]:
     return json.loads((FIGURES / f"{name}.json").read_text(encoding="utf-8"))
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def whole_path(figures: dict[str, Any]) -> list[str]:
