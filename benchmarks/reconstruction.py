@@ -1,12 +1,13 @@
 """The benchmark set by every method at every preset: fitted from smoke on black with its true cameras, forecast, and scored.
 
     python -m benchmarks.reconstruction --out DIR [--presets draft,preview,final] [--methods default,as_published,fluidnexus]
-        [--scenes a,b] [--set section.field=value ...] [--again fit|scores] [--from SET] [--json docs/results/reconstruction.json]
+        [--scenes a,b] [--set section.field=value ...] [--again fit|scores] [--from SET] [--json FILE] [--page]
 
 What is read: SCENE/input. What it is scored on: SCENE/truth. A cell of the matrix is a job DIR/PRESET/METHOD/SCENE and, beside
 it, SCENE.json: what it cost, then its scores. What is there is not made again, and a job that was interrupted goes on; its
 times then count for nothing. DIR/results.json gathers every cell of DIR, `--json` writes it without the figures of single
-frames, for docs/results.md. One DIR holds one state of settings and weights; another one is refused, or made with `--again`.
+frames; `--page` puts that into docs/results, draws the pictures and makes docs/results.md. One DIR holds one state of settings
+and weights; another one is refused, or made with `--again`.
 Scenes marked as untouched are never looked at while anything is tuned.
 """
 
@@ -36,6 +37,7 @@ from backend.prior.weights import weights_fingerprint
 from backend.score.compare import best_trivial
 from benchmarks.cost import CHECKOUT, run_backend
 
+DOCS = CHECKOUT / "docs"
 SETS = CHECKOUT / "synthetic" / "bench"
 UNTOUCHED = ("obstacle_plume", "wind_wisp")  # for figures; nothing is tuned on them
 RESULTS_FILE = "results.json"
@@ -70,6 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="section.field=value")
     parser.add_argument("--again", choices=("fit", "scores"), help="make what was asked for once more")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--page", action="store_true", help="also docs/results.md, its figures and its pictures")
     given = parser.parse_args(arguments)
     root, failures = given.out.resolve(), 0
     scenes = given.scenes or sorted(path.parents[1].name for path in given.source.glob(f"*/{TRUTH_FOLDER}/{TRUTH_FILE}"))
@@ -89,13 +92,28 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 1
     write_text(root / RESULTS_FILE, as_text(results))
-    if given.json:
-        write_text(given.json, as_text({**results, "cells": [without_frames(cell) for cell in results["cells"]]}))
+    if not results["cells"]:
+        return 1
+    short = as_text({**results, "cells": [without_frames(cell) for cell in results["cells"]]})
+    for path in (given.json, DOCS / "results" / "reconstruction.json" if given.page else None):
+        if path is not None:
+            write_text(path, short)
+    if given.page:
+        run_module("benchmarks.reconstruction_figures", root, "--out", DOCS / "images", "--from", given.source.resolve())
+        run_module("tools.results")
     return 1 if failures else 0
 
 
+def run_module(name: str, *arguments: str | Path) -> None:
+    """In a process of its own: this one stays small, see benchmarks/cost.py. Raises CalledProcessError."""
+    command = [sys.executable, "-m", name, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=CHECKOUT, env=environment)
+
+
 def complete(cell: Cell, settings: list[str], *, again: str | None = None) -> dict[str, Any]:
-    """What is known of a cell, after whatever was missing of it was made. Raises RuntimeError where that does not work."""
+    """What is known of a cell, after whatever was missing of it was made. Raises RuntimeError where that does not work, and
+    CalledProcessError where scoring does not."""
     truth = json.loads((cell.scene / TRUTH_FOLDER / TRUTH_FILE).read_text(encoding="utf-8"))
     ahead = int(truth["frames"]["count"]) - int(truth["frames"]["seen"])
     changes = dict(text.split("=", 1) for text in (f"method={cell.method}", f"forecast.num_frames={ahead}", *settings))
@@ -104,6 +122,7 @@ def complete(cell: Cell, settings: list[str], *, again: str | None = None) -> di
     facts = {"settings": asdict(config), "weights": weights_fingerprint() if asks_prior else None}
     kept: dict[str, Any] = json.loads(cell.record.read_text(encoding="utf-8")) if cell.record.exists() else {}
     if again == "fit":
+        cell.record.unlink(missing_ok=True)  # first: without it nobody takes what is left of the job for whole
         shutil.rmtree(cell.job, ignore_errors=True)
         kept = {}
     if kept and {name: kept[name] for name in facts} != facts:
@@ -122,10 +141,8 @@ def complete(cell: Cell, settings: list[str], *, again: str | None = None) -> di
 
 
 def scores_of(cell: Cell) -> dict[str, Any]:
-    """In a process of its own: this one stays small, see benchmarks/cost.py."""
     part = cell.record.with_suffix(".scores.part")
-    command = [sys.executable, "-m", "backend", "evaluate", "--job", cell.job, "--truth", cell.scene, "--out", part]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=CHECKOUT, env={**os.environ, "PYTHONPATH": str(CHECKOUT)})
+    run_module("backend", "evaluate", "--job", cell.job, "--truth", cell.scene, "--out", part)
     scores = json.loads(part.read_text(encoding="utf-8"))
     part.unlink()
     return scores

@@ -205,8 +205,7 @@ def how(figures: dict[str, Any]) -> str:
     codes = sorted({cell["code"] for cell in cells})
     versions = ", ".join(f"{name} {number}" for name, number in figures["versions"].items())
     return (
-        "`python -m benchmarks.reconstruction --out DIR --json docs/results/reconstruction.json`, the pictures by "
-        "`python -m benchmarks.reconstruction_figures DIR --out docs/images`. Fitted from smoke on black with the true cameras; "
+        "`python -m benchmarks.reconstruction --out DIR --page`. Fitted from smoke on black with the true cameras; "
         "PSNR in dB of sRGB on black over the full frame, of single frames at most 50 (`global`: of the mean squared error of "
         "all of them); volumes and velocities inside true smoke. Scenes with * were never looked at while anything was tuned. "
         f"Machine: {machine['processor']}, {machine['cores']} cores, {machine['memory_gib']:.0f} GiB, {machine['system']}; "

@@ -15,6 +15,7 @@ def best_trivial(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind:
     return best, float(found[best])
 
 
-def lead(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind: str = "") -> float:
-    """How much more ours has of a figure than the best trivial answer, dB."""
-    return float(answers[OURS][figure]) - best_trivial(answers, figure, kind=kind)[1]
+def lead(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind: str = "") -> float | None:
+    """How much more ours has of a figure than the best trivial answer, dB; None where it has none."""
+    ours = answers[OURS][figure]
+    return None if ours is None else float(ours) - best_trivial(answers, figure, kind=kind)[1]

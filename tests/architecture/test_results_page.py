@@ -2,8 +2,29 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 from tools import results
 
 
 def test_the_page_agrees_with_its_figures() -> None:
     assert results.PAGE.read_text(encoding="utf-8") == results.page()
+
+
+def test_the_pictures_of_the_page_are_there_and_small() -> None:
+    names = re.findall(r"!\[[^]]*\]\(([^)]+)\)", results.page())
+    assert names
+    for name in names:
+        assert (results.PAGE.parent / name).stat().st_size < 400_000, name
+
+
+def test_the_reconstruction_is_told_when_and_only_when_it_was_measured() -> None:
+    assert ("## Reconstruction" in results.page()) == results.has("reconstruction")
+    if results.has("reconstruction"):
+        cells = results.load("reconstruction")["cells"]
+        for cell in cells:
+            mark = "*" if cell["scene"] in ("obstacle_plume", "wind_wisp") else ""
+            shown = f"{cell['scores']['input']['ours']['smoke_db']:.2f}"
+            assert f"| {cell['preset']} | {cell['method']} | {cell['scene']}{mark} | {shown} |" in results.page()
+        assert "by_frame_db" not in json.dumps(cells), "figures of single frames are in the pictures"

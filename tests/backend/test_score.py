@@ -12,7 +12,7 @@ import pytest
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.score import baselines, measures
-from backend.score.compare import best_trivial
+from backend.score.compare import best_trivial, lead
 from backend.score.evaluate import camera_axes, evaluate, table
 from backend.score.truth_set import Volume, read_truth_set
 
@@ -237,6 +237,42 @@ def test_what_is_wrong_scores_lower() -> None:
     assert name in {*baselines.TRIVIAL, "still mean"} and value == max(
         found["full_db"] for answer, found in scores["nvs"].items() if answer != "ours"
     )
+
+
+def test_a_prior_is_scored_as_the_reconstruction_is() -> None:
+    scene = TinyTruth()
+    scores = evaluate(Perfect(scene, brightness=0.5), scene, anchor=np.zeros(3), prior=Perfect(scene))  # type: ignore[arg-type]
+    assert scores["prior_volume"]["mass_ratio"] == pytest.approx(1.0) and scores["volume"]["mass_ratio"] == pytest.approx(0.5)
+    assert scores["prior_volume"]["velocity"]["correlation_up"] == pytest.approx(1.0)
+    assert "prior_volume" in table(scores)
+    assert "prior_volume" not in evaluate(Perfect(scene), scene, anchor=np.zeros(3))  # type: ignore[arg-type]
+
+
+def test_the_future_is_beside_what_is_frozen() -> None:
+    """A forecast that holds the last moment still is the frozen reconstruction; frozen trivial answers know nothing later."""
+
+    class Frozen(Perfect):
+        def picture(self, view: View, frame: int) -> np.ndarray:
+            return super().picture(view, min(frame, scene.num_seen - 1))
+
+    scene = TinyTruth()
+    for view in ("future_input", "future_nvs"):
+        found = evaluate(Frozen(scene), scene, anchor=np.zeros(3))[view]  # type: ignore[arg-type]
+        assert found["ours"] == found["frozen reconstruction"]
+        assert {"frozen copy", "frozen mirror", "frozen billboard", "still mean", "black", "grey"} < set(found)
+        assert "first_db" not in found["ours"]
+        assert lead(found, "full_db", kind="frozen rec") == 0.0
+    last = scene.num_seen - 1
+    error = measures.squared_errors(scene.draw(scene.view("input", last), last), scene.draw(scene.view("nvs", 6), 6))[0]
+    assert found["frozen copy"]["by_frame_db"] == {"6": pytest.approx(measures.decibels(error), abs=1e-3)}
+
+
+def test_the_best_trivial_answer_is_never_ours() -> None:
+    answers = {"ours": {"db": 30.0}, "copy": {"db": 25.0}, "frozen copy": {"db": 28.5}, "black": {"db": None}}
+    assert best_trivial(answers, "db") == ("frozen copy", 28.5)
+    assert best_trivial(answers, "db", kind="copy") == ("copy", 25.0)
+    assert lead(answers, "db") == 1.5 and lead(answers, "db", kind="copy") == 5.0
+    assert lead({**answers, "ours": {"db": None}}, "db") is None
 
 
 def test_thirds_follow_the_seen_frames() -> None:

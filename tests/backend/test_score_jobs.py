@@ -1,0 +1,90 @@
+"""What a job is scored on besides pictures: proposed volumes, the divergence of its motion, its buoyancy."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from backend.fit.state import VolumeRecord
+from backend.io.particles import ParticleFrame
+from backend.score.particles import learned_buoyancy, mean_divergence
+from backend.score.proposals import Proposals
+from backend.score.truth_set import Volume
+
+
+def truth_volume() -> Volume:
+    return Volume(density=np.zeros((7, 9, 11)), velocity=None, voxel_size=0.2, origin=np.array([-0.4, 1.3, 2.0]))
+
+
+def test_a_lattice_has_the_voxels_of_its_volume() -> None:
+    like = truth_volume()
+    centres = like.lattice.centres()
+    assert centres.shape == (7, 9, 11, 3)
+    assert np.allclose(centres[2, 0, 5], like.origin + 0.2 * np.array([2, 0, 5]))
+
+
+def test_proposals_stand_where_their_grids_do() -> None:
+    """A density linear in the world's x and z, on a grid that is turned by 30 degrees and moved: looked up it is itself."""
+    c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
+    from_world = np.eye(4)
+    from_world[:3, :3] = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+    from_world[:3, 3] = -from_world[:3, :3] @ np.array([0.2, 2.1, 3.0])
+    size, shape = 0.25, (20, 22, 24)
+    own = size * (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) - 0.5 * (np.array(shape) - 1))
+    world = (own - from_world[:3, 3]) @ from_world[:3, :3]
+    density = 10.0 + world[..., 0] + 2.0 * world[..., 2]
+    velocity = np.broadcast_to(np.array([1.0, -2.0, 3.0]), (*shape, 3))
+    record = VolumeRecord(
+        density=(density / 4.0).astype(np.float32), velocity=velocity.astype(np.float32), from_world=from_world,
+        voxel_size=np.asarray(size), density_unit=np.asarray(4.0),
+    )  # fmt: skip
+    like = truth_volume()
+    wanted = like.lattice.centres()
+    empty = VolumeRecord(
+        density=np.zeros(shape, np.float32), velocity=np.zeros((*shape, 3), np.float32), from_world=from_world,
+        voxel_size=np.asarray(size),
+    )  # fmt: skip
+    found, moves = Proposals([empty, record], frame_start=3).volume(like, 4)
+    assert np.allclose(found, 10.0 + wanted[..., 0] + 2.0 * wanted[..., 2], atol=1e-4)
+    assert np.allclose(moves, [1.0, -2.0, 3.0])
+    far = Volume(density=np.zeros((2, 2, 2)), velocity=None, voxel_size=0.2, origin=np.full(3, 50.0))
+    assert not Proposals([record], frame_start=0).volume(far, 0)[0].any()
+    with pytest.raises(IndexError):
+        Proposals([record], frame_start=0).volume(like, 1)
+
+
+def particles(*frames: ParticleFrame, radius: float = 0.5, buoyancy: tuple[float, ...] = (0.0, 0.0, 0.0)) -> SimpleNamespace:
+    """As much of an open particles.h5 as is asked."""
+    info = SimpleNamespace(fluid={"smoothing_length_m": radius}, buoyancy=buoyancy)
+    return SimpleNamespace(info=info, num_frames=len(frames), frame=lambda index: frames[index])
+
+
+def expanding(rate: float, count: int = 400) -> ParticleFrame:
+    positions = np.random.default_rng(4).uniform(-1.0, 1.0, (count, 3))
+    ones = np.ones(count, np.float32)
+    return ParticleFrame(
+        positions=positions, velocities=(rate * positions).astype(np.float32), scales=ones, optical_masses=ones,
+        colors=np.ones((count, 3), np.float32), ids=np.arange(count),
+    )  # fmt: skip
+
+
+def test_divergence_of_an_even_expansion() -> None:
+    """v = a x has div v = 3 a everywhere; the mean is over the frames that hold particles."""
+    found = mean_divergence(particles(expanding(0.2), expanding(0.4), expanding(9.0, count=0)))  # type: ignore[arg-type]
+    assert found["corrected"] == pytest.approx(0.9, rel=1e-3)
+    assert 0.8 < found["as_published"] <= 0.9 and 0.9 < found["coverage"] <= 1.0
+
+
+def test_what_no_frame_tells_is_left_out() -> None:
+    assert mean_divergence(particles(expanding(1.0, count=0))) == {}  # type: ignore[arg-type]
+    lonely = mean_divergence(particles(expanding(1.0, count=2)))  # type: ignore[arg-type]
+    assert "corrected" not in lonely and lonely["coverage"] == 0.0
+
+
+def test_the_direction_of_buoyancy() -> None:
+    assert learned_buoyancy(particles(buoyancy=(0.0, 0.0, 2.0))) == {"strength": 2.0, "degrees_from_up": 0.0}  # type: ignore[arg-type]
+    assert learned_buoyancy(particles(buoyancy=(3.0, 0.0, 3.0)))["degrees_from_up"] == pytest.approx(45.0)  # type: ignore[arg-type]
+    assert learned_buoyancy(particles(buoyancy=(0.0, 0.0, -1.0)))["degrees_from_up"] == 180.0  # type: ignore[arg-type]
+    assert learned_buoyancy(particles()) == {"strength": 0.0}  # type: ignore[arg-type]
