@@ -14,7 +14,7 @@ import numpy as np
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
 from backend.fit.depths import Depths
-from backend.fit.follow import Balance, points_on_rays
+from backend.fit.follow import FOLLOW_PLACES, Balance, points_on_rays
 from backend.fit.guide import Guide
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
@@ -32,8 +32,7 @@ FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones m
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel
-FOLLOW_PLACES = 0.3  # share of the flow that turns the particles' density into the volume's
-FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm)
+FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
 
 
 class Appearance:

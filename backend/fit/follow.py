@@ -12,6 +12,7 @@ from scipy import fft, ndimage
 from backend.fit.guide import Guide
 from backend.geometry.camera import View
 
+FOLLOW_PLACES = 0.3  # share of the flow that turns the particles' density into the volume's, a frame
 _BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away

@@ -10,6 +10,7 @@ import numpy as np
 from backend.fit import depth_prior, explain
 from backend.fit.carry import as_fluid
 from backend.fit.depths import Depths
+from backend.fit.follow import points_on_rays
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
@@ -87,11 +88,16 @@ class Supply:
         prior = self.prior(frame)
         count = int((missing * pixel_mass(view, prior.center_depth)).sum() / self.unit_mass)
         weight = missing if len(record.positions) else prior.half_thickness * (prior.is_smoke & (missing > 0.0))
-        points, _ = depth_prior.sample_points(weight, count, prior, view, seed=self.seed + 7919 * frame, is_even=True)
+        seed = self.seed + 7919 * frame
+        points, pixels = depth_prior.sample_points(weight, count, prior, view, seed=seed, is_even=True)
         if len(points) == 0:
             return record
+        guide = self.depths.guide(frame)
         velocities = np.zeros_like(points)
-        if len(record.positions):
+        if guide is not None:
+            points = points_on_rays(guide, view, pixels, points, seed=seed)
+            velocities = guide.velocity_at(points).astype(np.float64)
+        elif len(record.positions):
             state = as_fluid(record)
             velocities = interpolate_velocity(points, state, self.parameters.smoothing_length)[0]
         return join(

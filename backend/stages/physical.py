@@ -4,6 +4,7 @@ From one frame to the next: position-based fluid step with the buoyancy learned 
 takes its share of the sideways displacement; gradient steps move what still projects to the wrong place; masses
 follow the frame, smoke that nobody explains is born at the depth of the prior, smoke that is gone dies. What the
 frames changed about the velocities is, in the mean, the force that the fluid lacked: buoyancy is solved from it.
+Where volumes are proposed, they lead instead: their velocity carries, their density draws near.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from backend.contract.job import PhysicalConfig, PublishedConfig
 from backend.fit import depth_prior, image_motion
 from backend.fit.carry import as_fluid
 from backend.fit.depths import Depths
+from backend.fit.follow import FOLLOW_PLACES, Balance
+from backend.fit.guide import Guide
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VolumeRecord
@@ -77,8 +80,11 @@ class _Fit:
         self.parameters = self.supply.parameters
 
     def start(self) -> PhysicalRecord:
-        """Frame 0: the prior's points with the image's motion."""
+        """Frame 0: the prior's points with the volume's or the image's motion."""
         born = self.supply.with_births(self.supply.empty(), 0)
+        guide = self.depths.guide(0)
+        if guide is not None:
+            return replace(born, velocities=guide.velocity_at(born.positions).astype(np.float64))
         if len(self.layers) < 2 or len(born.positions) == 0:
             return born
         wanted, confidence = self._observed(born.positions, 0)
@@ -89,31 +95,41 @@ class _Fit:
         """The record of `frame` from that of the frame before."""
         if len(record.positions) == 0:
             return self.supply.with_births(record, frame)
+        before, after = self.depths.guide(frame - 1), self.depths.guide(frame)
+        if before is not None and after is not None:
+            current = self._led(record, before, after)
+        else:
+            current = self._filtered(record, frame)
+        return self.supply.with_births(self.supply.weighed(current, frame), frame)
+
+    def _led(self, record: PhysicalRecord, before: Guide, after: Guide) -> PhysicalRecord:
+        """Moved as the volumes say, and a share of the way to their density."""
+        positions = before.carried(record.positions, after, seconds=self.scene.seconds_per_frame)
+        positions = positions + FOLLOW_PLACES * Balance(after, positions, record.masses).displacement()
+        velocities = after.velocity_at(positions).astype(np.float64)
+        learned = self._learn_buoyancy(record, velocities, np.ones(len(positions)), substeps=1)
+        return replace(learned, positions=positions, velocities=velocities)
+
+    def _filtered(self, record: PhysicalRecord, frame: int) -> PhysicalRecord:
+        """Moved as the fluid predicts, corrected by what the images show."""
         dt = self.scene.seconds_per_frame
         parameters = replace(self.parameters, buoyancy=tuple(record.buoyancy))
         state, taken = fluids.step(as_fluid(record), parameters, dt)
         predicted = state.positions
         wanted, confidence = self._observed(record.positions, frame - 1)
         gain = self.config.flow_gain * confidence[:, None]
-        lack = record.positions + wanted - predicted
-        if self.depths.volumes is None:
-            lack = _sideways(lack, self.scene.views[frame])
+        lack = _sideways(record.positions + wanted - predicted, self.scene.views[frame])
         positions = predicted + self._smooth(gain * lack, record)
         moved = self._corrected(replace(record, positions=positions), frame)
         moved = depth_prior.contain(moved, self.supply.prior(frame), self.scene.views[frame], share=CONTAINMENT)
         velocities = (moved - record.positions) / dt
         learned = self._learn_buoyancy(record, velocities, confidence, taken.substeps)
-        current = replace(learned, positions=moved, velocities=velocities)
-        return self.supply.with_births(self.supply.weighed(current, frame), frame)
+        return replace(learned, positions=moved, velocities=velocities)
 
     # -- parts of a step ------------------------------------------------------------------------------------------
 
     def _observed(self, positions: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement [N, 3] m that volumes or images ask for from `frame` to the next, and its confidence [N]."""
-        guide, next_guide = self.depths.guide(frame), self.depths.guide(frame + 1)
-        if guide is not None and next_guide is not None:
-            moved = guide.carried(positions, next_guide, seconds=self.scene.seconds_per_frame)
-            return moved - positions, np.ones(len(positions))
+        """Displacement [N, 3] m that the images ask for from `frame` to the next, and its confidence [N]."""
         before, after = self.layers[frame], self.layers[frame + 1]
         flow = image_motion.dense_flow(before, after)
         views = (self.scene.views[frame], self.scene.views[frame + 1])

@@ -1,0 +1,104 @@
+"""What the last frames of a fit tell of the next ones: how each parcel goes on, which are doubtful, how far to trust it.
+
+Smoke goes on as it went: a parcel keeps the velocity that it had. Over the seconds that a forecast is good for that was
+better than a fluid under pressure and buoyancy, for what those do to a field that is known only roughly is rougher still.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from backend.contract.job import ForecastConfig
+from backend.fit import explain
+from backend.fit.carry import as_fluid
+from backend.fit.guide import Guide
+from backend.fit.refine import as_gaussians
+from backend.fit.scene import optical_depth
+from backend.fit.series import Series
+from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
+from backend.geometry.camera import View
+from backend.physics.fluid import number_density
+from backend.physics.interpolate import interpolate_velocity
+from backend.render import splat as renderer
+
+RECENT = 4  # frames whose velocities are averaged: one alone holds the correction of its own picture
+_REWEIGHTINGS = 6  # of what stays, to the last picture
+_SHARPNESS = 2.0  # power of a parcel's density against the usual one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trust:
+    """How far a forecast may be trusted. speed: m/s, root mean square; rate: 1/s, at which trust in the motion is lost."""
+
+    speed: float
+    rate: float
+    spreading: float  # standard deviation of a parcel's way, share of it
+
+    def share_moved(self, seconds: float) -> float:
+        """Of the smoke; the rest stays where it was seen last."""
+        return math.exp(-self.rate * seconds)
+
+    def growth(self, seconds: float) -> float:
+        """m: standard deviation of where moved smoke is."""
+        return self.spreading * self.speed * seconds
+
+    def deviation(self, seconds: float) -> float:
+        """m: standard deviation of where smoke is, moved or not (law of total variance: within, and between the two)."""
+        share, way = self.share_moved(seconds), self.speed * seconds
+        return math.sqrt(share * self.growth(seconds) ** 2 + share * (1.0 - share) * way**2)
+
+
+def trust_of(record: VisualRecord, config: ForecastConfig) -> Trust:
+    """From the last frame alone. Trust is lost with the ways that smoke goes, in units of its own size."""
+    masses = record.optical_masses.astype(np.float64)
+    total = float(masses.sum())
+    if not total > 0.0:
+        return Trust(speed=0.0, rate=0.0, spreading=config.spreading)
+    squares = np.square(record.velocities, dtype=np.float64).sum(axis=1)
+    speed = math.sqrt(float(masses @ squares) / total)
+    offsets = record.positions - masses @ record.positions / total
+    spreads = np.sqrt(masses @ np.square(offsets) / total)  # [3] m
+    size = float(np.cbrt(np.prod(spreads)))
+    return Trust(speed=speed, rate=config.fading * speed / size if size > 0.0 else 0.0, spreading=config.spreading)
+
+
+def recent_velocity(
+    points: np.ndarray,  # [N, 3] m
+    fluid: Series[PhysicalRecord],
+    volumes: Series[VolumeRecord] | None,
+) -> np.ndarray:  # [N, 3] m/s
+    """Mean of the last frames' velocities there: of the physical particles and, where there are volumes, of those too.
+
+    The particles' are sharper and drawn to what the pictures show, the volumes' know depth; their errors differ.
+    """
+    found: list[np.ndarray] = []
+    for back in range(1, min(RECENT, len(fluid)) + 1):
+        record = fluid[len(fluid) - back]
+        found.append(interpolate_velocity(points, as_fluid(record), float(record.smoothing_length))[0])
+        if volumes is not None and len(volumes) >= len(fluid):
+            found.append(Guide(volumes[len(fluid) - back]).velocity_at(points))
+    return np.mean(found, axis=0)
+
+
+def gathered_masses(
+    record: VisualRecord,
+    layer: np.ndarray,  # [H, W, 4] premultiplied linear RGB and opacity of the record's frame
+    view: View,
+    *,
+    length: float,  # m, within which parcels are near each other
+) -> np.ndarray:  # [N] float32 m^2
+    """Optical masses that show the same picture with less in parcels that hardly others are near to.
+
+    One view does not tell where on a ray smoke is, and what the fit has scattered in depth drifts off on its own. Dense
+    smoke on the same rays takes over: (d / (d + median))^2 of each mass, then multiplicative updates (Richardson 1972).
+    """
+    if len(record.positions) == 0:
+        return record.optical_masses
+    density = number_density(record.positions, length)
+    share = (density / (density + np.median(density))) ** _SHARPNESS
+    thinned = replace(record, optical_masses=(share * record.optical_masses).astype(np.float32))
+    splat = renderer.forward(as_gaussians(thinned), view)
+    return explain.fit_masses(splat, thinned.optical_masses, optical_depth(layer), iterations=_REWEIGHTINGS, consistency=0.0)[1]
