@@ -187,15 +187,19 @@ class WILDSMOKE_PG_forecast(bpy.types.PropertyGroup):
     num_frames: IntProperty(
         name="Frames", description="Frames to forecast after the clip; 0 for none", default=0, min=0, max=10_000
     )
-    damping: FloatProperty(
-        name="Damping (1/s)", description="Share of the velocity lost in a second", default=0.5, min=0.0, max=100.0
-    )
-    persistence: FloatProperty(
-        name="Persistence",
-        description="How much of the carried smoke each step keeps, from 0 (the last frame stands still) to 1 (pure motion)",
-        default=0.9,
+    fading: FloatProperty(
+        name="Fading",
+        description="How fast smoke comes to rest in the last frame, in e-folds while it goes as far as it is large; 0: never",
+        default=0.3,
         min=0.0,
-        max=1.0,
+        max=100.0,
+    )
+    spreading: FloatProperty(
+        name="Spreading",
+        description="By how much moving smoke widens: standard deviation as a share of its way",
+        default=0.1,
+        min=0.0,
+        max=10.0,
     )
 
 

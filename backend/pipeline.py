@@ -248,21 +248,20 @@ class Pipeline:
         return mark
 
     def _forecast(self, smoke_mark: str, cameras_mark: str, visual_mark: str) -> str:
-        config = (self.config.forecast, self.config.visual)
-        mark = fingerprint(
-            "forecast", [asdict(part) for part in config], str(self.config.seed), smoke_mark, cameras_mark, visual_mark
-        )
+        config = self.config.forecast
+        mark = fingerprint("forecast", config, smoke_mark, cameras_mark, visual_mark)
 
         def write(report: StageReport) -> None:
             with (
                 open_stage_file(self.folder.smoke) as file,
                 RecordFile(self.folder.physical, PhysicalRecord) as fluid,
                 RecordFile(self.folder.visual, VisualRecord) as seen,
+                self._volumes() as volumes,
             ):
                 layers = FrameStack(file, "smoke")
                 records = forecast.run(
                     layers, read_cameras(self.folder.cameras), fluid, seen, config, report,
-                    seed=self.config.seed, method=self.config.method, published=self.config.published,
+                    method=self.config.method, published=self.config.published, volumes=volumes,
                 )  # fmt: skip
                 write_records(self.folder.forecast, mark, records)
 
@@ -324,10 +323,19 @@ class Pipeline:
                     "preset": self.job.preset,
                     "settings": asdict(self.config),
                     **({"prior_fingerprint": self.weights_mark} if self.weights_mark else {}),
+                    **self._doubt(seen[len(seen) - 1]),
                 },
                 fingerprint=mark,
             )
             writer.finish(info)
+
+    def _doubt(self, last: VisualRecord) -> dict[str, list[float]]:
+        """What the forecast says of its own uncertainty; nothing without one, and the published methods say nothing."""
+        config = self.config.forecast
+        if config.num_frames == 0 or self.config.method != "default":
+            return {}
+        seconds = 1.0 / read_cameras(self.folder.cameras).fps
+        return {"forecast_deviation_m": forecast.deviations(last, config, seconds=seconds)}
 
     def _prepare_sequence(self, mark: str) -> set[int]:
         """The frames of the VDB sequence that are there already; those of another export are removed first."""

@@ -198,18 +198,18 @@ class PublishedConfig:
 class ForecastConfig:
     """The most likely next frames.
 
-    num_frames: 0 for none. damping: share of the velocity lost a second, 1/s. persistence: how much of the carried
-    smoke a step keeps against the frozen last frame, 0 (freeze) to 1 (pure motion).
+    num_frames: 0 for none. fading: how fast trust in the motion is lost to the frozen last frame, e-folds while smoke goes
+    as far as it is large; 0 never. spreading: by how much moving smoke widens, standard deviation as a share of its way.
     """
 
     num_frames: int = 0
-    damping: float = 0.5
-    persistence: float = 0.9
+    fading: float = 0.3
+    spreading: float = 0.1
 
     def __post_init__(self) -> None:
         _check("num_frames", self.num_frames, 0, 10_000)
-        _check("damping", self.damping, 0.0, 100.0)
-        _check("persistence", self.persistence, 0.0, 1.0)
+        _check("fading", self.fading, 0.0, 100.0)
+        _check("spreading", self.spreading, 0.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

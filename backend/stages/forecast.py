@@ -1,11 +1,12 @@
-"""The most likely next frames: the last frame's smoke carried on by its own, slowly fading motion.
+"""The most likely next frames: the last frame's smoke goes on as it went, and the source on emitting.
 
-What is known of the future fades with the horizon, so each step also pulls the smoke back a little to what the last
-frame shows, as seen from its camera: near frames move, far ones come to rest at the frozen frame.
+What is known of the future fades with the horizon. So a share of the smoke stays where it was seen last, a share that
+grows; and what moves widens with the way that it has gone. Near frames move, far ones come to rest in a blur between.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,14 +14,18 @@ from dataclasses import replace
 import numpy as np
 
 from backend.contract.cameras import Cameras
-from backend.contract.job import ForecastConfig, PublishedConfig, VisualConfig
-from backend.fit.appearance import Appearance
-from backend.fit.carry import carry, with_velocities
+from backend.contract.job import ForecastConfig, PublishedConfig
+from backend.fit.future import Trust, gathered_masses, recent_velocity, trust_of
+from backend.fit.population import PER_PARTICLE, is_near_image, take
+from backend.fit.replay import births_at_foot, born_again
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
-from backend.fit.state import PhysicalRecord, VisualRecord
+from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
 from backend.published import future as published_future
 from backend.reporting import Report
+
+_REPLAYED = 8  # frames whose births the source repeats: a source that is dying must not live up again
+_EASE = 3.0  # frames in which masses go most of the way to the gathered ones, so that nothing jumps
 
 
 def run(
@@ -28,31 +33,65 @@ def run(
     cameras: Cameras,
     fluid: Series[PhysicalRecord],
     seen: Series[VisualRecord],
-    configs: tuple[ForecastConfig, VisualConfig],
+    config: ForecastConfig,
     report: Report,
     *,
-    seed: int,
     method: str = "default",
     published: PublishedConfig | None = None,  # the settings of the other methods
+    volumes: Series[VolumeRecord] | None = None,  # what is proposed for each frame; none: the particles alone tell
 ) -> Iterator[VisualRecord]:
     """Yields config.num_frames records behind the last frame."""
-    config, visual = configs
+    if config.num_frames == 0:
+        return
     scene = make_scene(layers, cameras)
-    last_fluid, last_seen = fluid[len(fluid) - 1], seen[len(seen) - 1]
+    view, seconds = scene.views[-1], scene.seconds_per_frame
     if method != "default":
         yield from published_future.run(
-            fluid, seen, published or PublishedConfig(), report,
-            num_frames=config.num_frames, view=scene.views[-1], seconds=scene.seconds_per_frame,
-        )  # fmt: skip
+            fluid, seen, published or PublishedConfig(), report, num_frames=config.num_frames, view=view, seconds=seconds
+        )
         return
-    appearance = Appearance(scene, layers, replace(visual, iterations=0), seed + 1)
-    record, last = last_seen, len(layers) - 1
+    last = seen[len(seen) - 1]
+    trust = trust_of(last, config)
+    length = float(fluid[len(fluid) - 1].smoothing_length)
+    gathered = gathered_masses(last, layers[len(layers) - 1], view, length=length)
+    still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
+    moving = _going_on(replace(last, next_id=2 * last.next_id), fluid, volumes)
+    births = [_going_on(newborn, fluid, volumes) for newborn in births_at_foot(seen)[-_REPLAYED:]]
+    wanted = gathered
     for step in range(config.num_frames):
         report.progress(step, config.num_frames)
-        fading = math.exp(-config.damping * (step + 0.5) * scene.seconds_per_frame)
-        faded = replace(last_fluid, velocities=fading * last_fluid.velocities)
-        record = carry(record, faded, seconds=scene.seconds_per_frame)
-        record, _ = appearance.look(record, last, consistency=config.persistence)
-        record = with_velocities(record, faded)
-        yield record
+        moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
+        moving = born_again(moving, births, step)
+        wanted = np.concatenate([wanted, moving.optical_masses[len(wanted) :]])
+        is_near = is_near_image(moving.positions, view)
+        moving, wanted = _eased(take(moving, is_near), wanted[is_near]), wanted[is_near]
+        still = _eased(still, gathered)
+        yield _expected(moving, still, trust, seconds * (step + 1))
     report.progress(config.num_frames, config.num_frames)
+
+
+def deviations(last: VisualRecord, config: ForecastConfig, *, seconds: float) -> list[float]:
+    """Standard deviation of where smoke is, m, in each of the config.num_frames frames; seconds: of a frame."""
+    trust = trust_of(last, config)
+    return [trust.deviation(seconds * (step + 1)) for step in range(config.num_frames)]
+
+
+def _going_on(record: VisualRecord, fluid: Series[PhysicalRecord], volumes: Series[VolumeRecord] | None) -> VisualRecord:
+    return replace(record, velocities=recent_velocity(record.positions, fluid, volumes).astype(np.float32))
+
+
+def _eased(record: VisualRecord, wanted: np.ndarray) -> VisualRecord:
+    """Masses one frame further on their way to the wanted ones [N] m^2."""
+    step = np.float32(1.0 - math.exp(-1.0 / _EASE))
+    return replace(record, optical_masses=record.optical_masses + step * (wanted - record.optical_masses))
+
+
+def _expected(moving: VisualRecord, still: VisualRecord, trust: Trust, seconds: float) -> VisualRecord:
+    """The mean over what may have become of the smoke, so many seconds behind the last frame."""
+    share, growth = np.float32(trust.share_moved(seconds)), np.float32(trust.growth(seconds))
+    wide = replace(moving, scales=np.hypot(moving.scales, growth), optical_masses=share * moving.optical_masses)
+    if share == 1.0:
+        return wide
+    faint = replace(still, optical_masses=(np.float32(1.0) - share) * still.optical_masses)
+    names = {item.name for item in dataclasses.fields(wide)} & PER_PARTICLE - {"rotations"}  # round ones, all of them
+    return replace(wide, **{name: np.concatenate([getattr(wide, name), getattr(faint, name)]) for name in names})
