@@ -40,6 +40,7 @@ def page() -> str:
         "Made by `python -m tools.results` from `docs/results/*.json`, which the named commands wrote. Times are of one "
         "shared machine with two cores that was not always quiet; ratios and memory depend on that less.\n",
         *(reconstruction(load("reconstruction"), IMAGES) if has("reconstruction") else []),
+        *(tilted_scene(load("tilted_scene")) if has("tilted_scene") else []),
         *whole_path(load("whole_path")),
         *input_view(load("view_demo"), load("view_plume"), load("view_wildfire")),
         *forecast(load("forecast_demo"), load("forecast_plume")),
@@ -58,6 +59,25 @@ def has(name: str) -> bool:
 
 def load(name: str) -> dict[str, Any]:
     return json.loads((FIGURES / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def tilted_scene(figures: dict[str, Any]) -> list[str]:
+    rows = [
+        [
+            row["scene"] + ("*" if row["untouched"] else ""),
+            row["preset"],
+            f"{row['tilt_degrees']:g}",
+            f"{row['strength']:.2f}",
+            "-" if row["degrees_from_up"] is None else f"{row['degrees_from_up']:.1f}",
+        ]
+        for row in figures["rows"]
+    ]
+    return [
+        "## Which way is up\n",
+        "`python -m benchmarks.tilted_scene --out DIR --json docs/results/tilted_scene.json`: the world of each scene is turned, "
+        "and the learned buoyancy should be within 10 degrees of the turned up.\n",
+        table(["scene", "preset", "turned by, degrees", "buoyancy, m/s^2", "off, degrees"], rows),
+    ]
 
 
 def whole_path(figures: dict[str, Any]) -> list[str]:

@@ -9,18 +9,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tiny_bench
 from small_job import SMALL
 from test_prior_job import Heard, written
 from tiny_bench import NUM_FRAMES, NUM_SEEN, VIEWS, draw_scene
 
 from backend.contract.errors import BackendError
 from backend.contract.job import Job
+from backend.contract.result import read_result
 from backend.events_out import StopRequest
+from backend.geometry.camera import view_at
 from backend.io.job_folder import JobFolder
 from backend.pipeline import run_job
 from backend.score.finished_job import score_job
 from backend.score.truth_set import read_truth_set
-from benchmarks import reconstruction, reconstruction_figures
+from benchmarks import reconstruction, reconstruction_figures, tilted_scene
 from tools import results
 
 SETTINGS = {name: value for name, value in SMALL.items() if not name.startswith("forecast.")} | {
@@ -143,6 +146,34 @@ def test_a_job_that_asked_the_prior_is_scored_beside_it(bench: Path, tmp_path: P
     scores = score_job(JobFolder(tmp_path), read_truth_set(scene))
     assert -1.0 < scores["prior_volume"]["correlation"] < 1.0 and scores["prior_volume"]["mass_ratio"] > 0.0
     assert list(scores["side"]["ours"]["by_frame_db"]) == [str(frame) for frame in VIEWS["side"]]
+
+
+def test_a_turned_world_turns_the_answer(bench: Path, tmp_path: Path) -> None:
+    """Turned by 0 and by 30 degrees: the same pictures, and a buoyancy that is measured against another up."""
+    rows = []
+    for degrees in (0.0, 30.0):
+        settings = [part for key, value in SETTINGS.items() for part in ("--set", f"{key}={value}")]
+        basis = ["--out", str(tmp_path), "--from", str(bench), "--preset", "draft", "--degrees", f"{degrees}"]
+        assert tilted_scene.main([*basis, *settings, "--json", str(tmp_path / "rows.json")]) == 0
+        rows += json.loads((tmp_path / "rows.json").read_text())["rows"]
+        learned = np.array(read_result(tmp_path / f"wind_wisp_draft_{degrees:g}").buoyancy)
+        up = np.array([0.0, -np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
+        expected = np.degrees(np.arccos(learned @ up / np.linalg.norm(learned)))
+        assert rows[-1]["degrees_from_up"] == pytest.approx(expected, abs=0.01)
+    text = "\n".join(results.tilted_scene({"rows": rows}))
+    assert f"| wind_wisp* | draft | 30 | {rows[1]['strength']:.2f} | {rows[1]['degrees_from_up']:.1f} |" in text
+
+
+def test_tilted_cameras_see_a_tilted_world_alike() -> None:
+    cameras = tiny_bench.cameras("input")
+    turned = tilted_scene.tilted(cameras, 40.0)
+    points = np.random.default_rng(0).uniform(-1.0, 2.0, (20, 3))
+    for frame in (0, NUM_FRAMES - 1):
+        before = view_at(cameras, frame).project(points)
+        after = view_at(turned, frame).project(points @ tilted_scene.turn(40.0)[:3, :3].T)
+        assert np.allclose(before[0], after[0]) and np.allclose(before[1], after[1])
+    assert tilted_scene.degrees_between(np.zeros(3), np.ones(3)) is None
+    assert tilted_scene.degrees_between(np.array([0.0, 0.0, 3.0]), tilted_scene.turn(25.0)[:3, 2]) == pytest.approx(25.0)
 
 
 def test_a_job_of_fewer_frames_is_refused(made: Path, bench: Path) -> None:
