@@ -71,7 +71,7 @@ def run(
 
 
 def deviations(last: VisualRecord, config: ForecastConfig, *, seconds: float) -> list[float]:
-    """Standard deviation of where smoke is, m, in each of the config.num_frames frames; seconds: of a frame."""
+    """How far parcels are from where they will be, root mean square, m, in each of config.num_frames frames of `seconds`."""
     trust = trust_of(last, config)
     return [trust.deviation(seconds * (step + 1)) for step in range(config.num_frames)]
 
