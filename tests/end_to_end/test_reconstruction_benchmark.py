@@ -27,6 +27,7 @@ from benchmarks import reconstruction, reconstruction_figures, tilted_scene
 from tools import results
 
 SETTINGS = {name: value for name, value in SMALL.items() if not name.startswith("forecast.")} | {
+    "volume.use_prior": "false",
     "published.num_physical": "80",
     "published.num_particles": "150",
     "published.physical_iterations": "1",
