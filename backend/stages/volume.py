@@ -11,16 +11,22 @@ import torch
 
 from backend.contract.cameras import Cameras
 from backend.field.rays import at_voxels, optical_depth
+from backend.fit.depth_prior import inflate
+from backend.fit.gather import gathered
+from backend.fit.guide import Guide
 from backend.fit.pace import stride_of
 from backend.fit.region import find_region
-from backend.fit.scene import make_scene
+from backend.fit.scene import Scene, make_scene
+from backend.fit.scene import optical_depth as smoke_depth
 from backend.fit.series import Series
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.predict import Prior, Proposal, one_thread
+from backend.prior.window import Stand
 from backend.reporting import Report
 
+LEAST_TURN = np.radians(5.0)
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 _UPDATES = 2  # towards the frame's own optical depth
 _FLOOR = 0.01  # optical depth added to both sides of a ratio
@@ -39,9 +45,13 @@ def run(
 ) -> Iterator[VolumeRecord]:
     """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
 
-    The prior knows upright worlds only: the scene is turned upright before it is asked, and its answer back.
+    None either where the camera hardly goes around the smoke: then nothing is seen of its depth, and the silhouette's
+    solid is the better answer. The prior knows upright worlds only: the scene is turned upright before it is asked, and its
+    answer back.
     """
     scene = make_scene(layers, cameras)
+    if turned_about(scene) < LEAST_TURN:
+        return
     straight = upright(up_of(scene.views))
     anchor = straight[:3, :3] @ scene.anchor
     scene = replace(scene, views=tuple(turned(view, straight) for view in scene.views), anchor=anchor)
@@ -64,7 +74,16 @@ def run(
         )
 
     def recorded(proposal: Proposal, frame: int) -> VolumeRecord:
-        density, density_unit = _halved(agreed(proposal, region.depths[frame], region.views[frame]))
+        depth, view, full = region.depths[frame], region.views[frame], scene.views[frame]
+        own = VolumeRecord(
+            density=agreed(proposal.density, proposal.stand, depth, view),
+            velocity=proposal.velocity,
+            from_world=proposal.stand.from_world,
+            voxel_size=np.asarray(region.voxel_size),
+        )
+        solid = inflate(smoke_depth(layers[frame]), full, scene.anchor)
+        density = agreed(gathered(Guide(own), full, solid), proposal.stand, depth, view)
+        density, density_unit = _halved(density)
         velocity, velocity_unit = _halved(proposal.velocity @ straight[:3, :3].astype(np.float32))
         return VolumeRecord(
             density=density,
@@ -86,10 +105,17 @@ def run(
     report.progress(len(layers), len(layers))
 
 
-def agreed(proposal: Proposal, depth: np.ndarray, view: View) -> np.ndarray:
-    """The proposal's density [X, Y, Z] 1/m with the optical depth [h, w] that the frame shows in `view`: a few multiplicative
-    updates along the rays (Gordon 1970)."""
-    lattice, own, density = proposal.stand.lattice, proposal.stand.seen(view), proposal.density
+def turned_about(scene: Scene) -> float:
+    """Radians: the largest angle between two frames' cameras as seen from the smoke's anchor."""
+    ways = np.array([view.position for view in scene.views]) - scene.anchor
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    return float(np.arccos(np.clip((ways @ ways.T).min(), -1.0, 1.0)))
+
+
+def agreed(density: np.ndarray, stand: Stand, depth: np.ndarray, view: View) -> np.ndarray:
+    """Density [X, Y, Z] 1/m with the optical depth [h, w] that its frame shows in `view`: a few multiplicative updates along
+    the rays (Gordon 1970)."""
+    lattice, own = stand.lattice, stand.seen(view)
     for _ in range(_UPDATES):
         ratio = (depth + _FLOOR) / (optical_depth(density, lattice, own) + _FLOOR)
         ratio = np.clip(ratio, 1.0 / _MOST_RATIO, _MOST_RATIO).astype(np.float32)

@@ -122,3 +122,8 @@ def test_a_guide_reads_records_in_their_own_units(prior: Prior) -> None:
     assert Guide(whole).density_at(points).max() > 0.0
     np.testing.assert_array_equal(Guide(record).density_at(points), Guide(whole).density_at(points))
     np.testing.assert_array_equal(Guide(record).velocity_at(points), Guide(whole).velocity_at(points))
+
+
+def test_a_camera_that_stands_still_tells_nothing_of_depth(prior: Prior) -> None:
+    still = replace(CAMERAS, camera_to_world=(CAMERAS.camera_to_world[0],) * NUM_FRAMES)
+    assert list(volume.run(layers(), still, SilentReport(), prior=prior, done=[])) == []
