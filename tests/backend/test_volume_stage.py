@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from backend.contract.cameras import Cameras
+from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
 from backend.geometry.camera import view_at
 from backend.prior.network import PlumeNet
@@ -127,3 +128,20 @@ def test_a_guide_reads_records_in_their_own_units(prior: Prior) -> None:
 def test_a_camera_that_stands_still_tells_nothing_of_depth(prior: Prior) -> None:
     still = replace(CAMERAS, camera_to_world=(CAMERAS.camera_to_world[0],) * NUM_FRAMES)
     assert list(volume.run(layers(), still, SilentReport(), prior=prior, done=[])) == []
+
+
+def test_haze_goes_to_where_most_smoke_is() -> None:
+    density = np.array([[[4.0, 1.0, 0.0]]], np.float32)
+    np.testing.assert_allclose(volume.sharpened(density), [[[4.0, 0.25, 0.0]]])
+    assert volume.sharpened(np.zeros((2, 2, 2), np.float32)).max() == 0.0
+
+
+def test_the_rays_keep_what_the_frame_shows(prior: Prior) -> None:
+    shown = layers()
+    for frame, record in enumerate(volume.run(shown, CAMERAS, SilentReport(), prior=prior, done=[])):
+        guide, view = Guide(record), view_at(CAMERAS, frame)
+        found = optical_depth(guide.density, guide.lattice, guide.stand.seen(view))
+        wanted = -np.log1p(-np.minimum(shown[frame][..., 3], 0.996))
+        blurred = [cv2.GaussianBlur(image.astype(np.float32), (0, 0), 3.0) for image in (found, wanted)]
+        inside = blurred[1] > 0.3 * blurred[1].max()
+        assert np.abs(blurred[0] / blurred[1] - 1.0)[inside].mean() < 0.15

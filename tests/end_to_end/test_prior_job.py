@@ -24,6 +24,7 @@ from backend.pipeline import STAGES, run_job, stages_of
 from backend.prior.network import PlumeNet
 from backend.prior.predict import save_weights
 from backend.prior.weights import weights_fingerprint
+from synthetic.sweep import Orbit, orbit_cameras
 
 NUM_FRAMES = 7
 WITHOUT = tuple(name for name in STAGES if name != "volume")
@@ -69,7 +70,12 @@ def written(path: Path, *, seed: int) -> Path:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return draw_plume(tmp_path_factory.mktemp("clip") / "plume", num_frames=NUM_FRAMES)
+    """A camera goes around the smoke: one that stands still is not asked for depth."""
+    folder = tmp_path_factory.mktemp("clip")
+    orbit = Orbit(azimuth_start=0.0, azimuth_stop=20.0)
+    cameras = orbit_cameras(orbit, width=48, height=64, fps=15.0, num_frames=NUM_FRAMES)
+    (folder / "cameras.json").write_text(cameras.to_json(), encoding="utf-8")
+    return draw_plume(folder / "plume", num_frames=NUM_FRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +87,7 @@ def run(clip: Path, folder: Path, weights: Path, *, stop: StopRequest | None = N
     heard = Heard()
     asked = {"volume.use_prior": True, **{key.replace("__", "."): value for key, value in changes.items()}}
     folder.mkdir(exist_ok=True)
-    JobFolder(folder).write_job(Job(video=str(clip), overrides={**SMALL, **asked}))
+    JobFolder(folder).write_job(Job(video=str(clip), cameras=str(clip.parent / "cameras.json"), overrides={**SMALL, **asked}))
     run_job(folder, heard, stop or StopRequest(), weights=weights)
     return heard
 
