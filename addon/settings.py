@@ -115,7 +115,7 @@ class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
     use_prior: BoolProperty(
         name="Trained Prior",
         description="Ask a network trained on simulated smoke for depth and motion; else the images tell alone",
-        default=False,
+        default=True,
     )
     stride: IntProperty(
         name="Stride",

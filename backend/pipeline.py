@@ -188,11 +188,12 @@ class Pipeline:
             from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
             from backend.stages import volume
 
+            config = self.config.volume
             with open_stage_file(self.folder.smoke) as file:
                 parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
                 records = volume.run(
                     FrameStack(file, "smoke"), read_cameras(self.folder.cameras), report,
-                    prior=Prior(self.weights), done=parts, stride=self.config.volume.stride,
+                    prior=Prior(self.weights), done=parts, stride=config.stride,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.volume, mark, parts)

@@ -104,7 +104,7 @@ class VolumeConfig:
     stride: frames between the images that it compares; 0 finds it from the motion.
     """
 
-    use_prior: bool = False
+    use_prior: bool = True
     stride: int = 0
 
     def __post_init__(self) -> None:

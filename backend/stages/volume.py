@@ -24,7 +24,7 @@ from backend.reporting import Report
 
 LEAST_TURN = np.radians(5.0)
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
-SHARPNESS = 2.0
+SHARPNESS = 1.5  # tuned on puff_front, merging_sources and steady_plume
 _UPDATES = 4  # towards the frame's own optical depth
 _FLOOR = 0.01  # optical depth added to both sides of a ratio
 _MOST_RATIO = 4.0

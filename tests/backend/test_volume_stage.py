@@ -132,7 +132,7 @@ def test_a_camera_that_stands_still_tells_nothing_of_depth(prior: Prior) -> None
 
 def test_haze_goes_to_where_most_smoke_is() -> None:
     density = np.array([[[4.0, 1.0, 0.0]]], np.float32)
-    np.testing.assert_allclose(volume.sharpened(density), [[[4.0, 0.25, 0.0]]])
+    np.testing.assert_allclose(volume.sharpened(density), [[[4.0, 0.5, 0.0]]])
     assert volume.sharpened(np.zeros((2, 2, 2), np.float32)).max() == 0.0
 
 
