@@ -6,6 +6,7 @@ video -> frames -> smoke layer -> cameras -> (volumes) -> physical particles -> 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import time
@@ -25,6 +26,7 @@ from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.population import buoyancy_of
+from backend.fit.scene import make_scene, turned_about
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
@@ -48,6 +50,9 @@ def stages_of(config: Config) -> tuple[str, ...]:
 
 def _asks_prior(config: Config) -> bool:
     return config.volume.use_prior and config.method == "default"
+
+
+LEAST_TURN = math.radians(5.0)  # of the camera about the smoke, for the prior to be asked
 
 
 def run_job(path: Path, sink: EventSink, stop: StopRequest, *, weights: Path = WEIGHTS) -> Result:
@@ -185,22 +190,26 @@ class Pipeline:
         mark = fingerprint("volume", self.config.volume, self.weights_mark, smoke_mark, cameras_mark)
 
         def write(report: StageReport) -> None:
-            from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
-            from backend.stages import volume
-
-            config = self.config.volume
             with open_stage_file(self.folder.smoke) as file:
+                layers, cameras = FrameStack(file, "smoke"), read_cameras(self.folder.cameras)
                 parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
-                records = volume.run(
-                    FrameStack(file, "smoke"), read_cameras(self.folder.cameras), report,
-                    prior=Prior(self.weights), done=parts, stride=config.stride,
-                )  # fmt: skip
-                _keep(parts, records)
+                # Where the camera hardly goes around the smoke nothing is seen of its depth: the silhouette's solid is the
+                # better answer, and torch need not be loaded.
+                if turned_about(make_scene(layers, cameras)) >= LEAST_TURN:
+                    _keep(parts, self._proposed(layers, cameras, report, parts))
             write_records(self.folder.volume, mark, parts)
             parts.remove()
 
         self._stage("volume", mark, read_stamp(self.folder.volume), write)
         return (mark,)
+
+    def _proposed(
+        self, layers: FrameStack, cameras: Cameras, report: StageReport, done: RecordFolder[VolumeRecord]
+    ) -> Iterator[VolumeRecord]:
+        from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
+        from backend.stages import volume
+
+        return volume.run(layers, cameras, report, prior=Prior(self.weights), done=done, stride=self.config.volume.stride)
 
     def _volumes(self) -> AbstractContextManager[RecordFile[VolumeRecord] | None]:
         """What the prior proposes, open for reading; None where it is not asked."""

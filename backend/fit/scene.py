@@ -80,3 +80,10 @@ def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.nd
     if np.linalg.eigvalsh(normal)[0] < MIN_PARALLAX * total:
         return _standing_point(views[0])
     return np.linalg.solve(normal, moment)
+
+
+def turned_about(scene: Scene) -> float:
+    """Radians: the largest angle between two frames' cameras as seen from the smoke's anchor."""
+    ways = np.array([view.position for view in scene.views]) - scene.anchor
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    return float(np.arccos(np.clip((ways @ ways.T).min(), -1.0, 1.0)))

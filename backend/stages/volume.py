@@ -13,7 +13,7 @@ from backend.contract.cameras import Cameras
 from backend.field.rays import at_voxels, optical_depth
 from backend.fit.pace import stride_of
 from backend.fit.region import find_region
-from backend.fit.scene import Scene, make_scene
+from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View
@@ -22,7 +22,6 @@ from backend.prior.predict import Prior, Proposal, one_thread
 from backend.prior.window import Stand
 from backend.reporting import Report
 
-LEAST_TURN = np.radians(5.0)
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 SHARPNESS = 1.5  # tuned on puff_front, merging_sources and steady_plume
 _UPDATES = 4  # towards the frame's own optical depth
@@ -42,13 +41,9 @@ def run(
 ) -> Iterator[VolumeRecord]:
     """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
 
-    None either where the camera hardly goes around the smoke: then nothing is seen of its depth, and the silhouette's
-    solid is the better answer. The prior knows upright worlds only: the scene is turned upright before it is asked, and its
-    answer back.
+    The prior knows upright worlds only: the scene is turned upright before it is asked, and its answer back.
     """
     scene = make_scene(layers, cameras)
-    if turned_about(scene) < LEAST_TURN:
-        return
     straight = upright(up_of(scene.views))
     anchor = straight[:3, :3] @ scene.anchor
     scene = replace(scene, views=tuple(turned(view, straight) for view in scene.views), anchor=anchor)
@@ -92,13 +87,6 @@ def run(
             for frame, proposal in enumerate(proposals, start=first):
                 yield recorded(proposal, frame)
     report.progress(len(layers), len(layers))
-
-
-def turned_about(scene: Scene) -> float:
-    """Radians: the largest angle between two frames' cameras as seen from the smoke's anchor."""
-    ways = np.array([view.position for view in scene.views]) - scene.anchor
-    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
-    return float(np.arccos(np.clip((ways @ ways.T).min(), -1.0, 1.0)))
 
 
 def sharpened(density: np.ndarray) -> np.ndarray:

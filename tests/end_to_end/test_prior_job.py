@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,12 +15,14 @@ from small_job import SMALL, assert_whole, digest, draw_plume
 from wildsmoke.addon.status import STAGE_LABELS
 
 from backend.contract import events
+from backend.contract.cameras import read_cameras
 from backend.contract.errors import BackendError, Cancelled
 from backend.contract.job import Config, Job, override
 from backend.events_out import StopRequest
+from backend.fit.state import VolumeRecord
 from backend.io.job_folder import JobFolder, fingerprint
 from backend.io.particles import read_particles
-from backend.io.records import read_stamp
+from backend.io.records import RecordFile, read_stamp
 from backend.pipeline import STAGES, run_job, stages_of
 from backend.prior.network import PlumeNet
 from backend.prior.predict import save_weights
@@ -166,6 +169,17 @@ def test_other_weights_make_what_follows_from_them_stale(job: Path, clip: Path, 
     assert heard.stages(skipped=False) == list(STAGES[3:])
     for name, mark in marks.items():
         assert read_stamp(folder / "stages" / f"{name}.h5") not in (None, mark, read_stamp(job / "stages" / f"{name}.h5"))
+
+
+def test_a_camera_that_stands_still_is_not_asked_for_depth(clip: Path, weights: Path, plain: Path, tmp_path: Path) -> None:
+    cameras = read_cameras(clip.parent / "cameras.json")
+    still = replace(cameras, camera_to_world=(cameras.camera_to_world[0],) * NUM_FRAMES)
+    (clip.parent / "still").mkdir()
+    (clip.parent / "still" / "cameras.json").write_text(still.to_json(), encoding="utf-8")
+    (clip.parent / "still" / "plume").symlink_to(clip)
+    run(clip.parent / "still" / "plume", tmp_path / "job", weights)
+    with RecordFile(tmp_path / "job/stages/volume.h5", VolumeRecord) as volumes:
+        assert len(volumes) == 0
 
 
 def test_without_the_prior_nothing_changes(plain: Path, clip: Path, tmp_path: Path) -> None:
