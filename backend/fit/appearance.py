@@ -31,7 +31,7 @@ RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in 
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
-CALM_COLOR = 0.25  # share of the way to the colour of its pixel
+CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
 FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
 
 
@@ -105,9 +105,9 @@ class Appearance:
         calmed = masses ** (1.0 - CALM_MASS) * common**CALM_MASS
         rows, columns = _pixels_of(record.positions, view)
         seen, opacity = layer[rows, columns, :3], layer[rows, columns, 3:]
-        shown = seen / np.maximum(opacity, 0.02)
-        share = CALM_COLOR * (opacity > 0.05)
-        colors = (1.0 - share) * record.colors + share * shown
+        usual = layer[..., :3].sum(axis=(0, 1)) / max(float(layer[..., 3].sum()), 1e-6)
+        shown = np.where(opacity > 0.05, seen / np.maximum(opacity, 0.02), usual)
+        colors = (1.0 - CALM_COLOR) * record.colors + CALM_COLOR * shown
         positions = depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH)
         return replace(record, positions=positions, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
 
