@@ -6,7 +6,6 @@ video -> frames -> smoke layer -> cameras -> (volumes) -> physical particles -> 
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 import time
@@ -26,7 +25,7 @@ from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.population import buoyancy_of
-from backend.fit.scene import make_scene, turned_about
+from backend.fit.scene import LEAST_TURN, make_scene, turned_about
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
@@ -50,9 +49,6 @@ def stages_of(config: Config) -> tuple[str, ...]:
 
 def _asks_prior(config: Config) -> bool:
     return config.volume.use_prior and config.method == "default"
-
-
-LEAST_TURN = math.radians(5.0)  # of the camera about the smoke, for the prior to be asked
 
 
 def run_job(path: Path, sink: EventSink, stop: StopRequest, *, weights: Path = WEIGHTS) -> Result:

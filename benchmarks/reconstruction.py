@@ -8,7 +8,7 @@ it, SCENE.json: what it cost, then its scores. What is there is not made again, 
 times then count for nothing. DIR/results.json gathers every cell of DIR, `--json` writes it without the figures of single
 frames; `--page` puts that into docs/results, draws the pictures and makes docs/results.md. One DIR holds one state of settings
 and weights; another one is refused, or made with `--again`.
-Scenes marked as untouched are never looked at while anything is tuned.
+Nothing is tuned on scenes marked as untouched.
 """
 
 from __future__ import annotations

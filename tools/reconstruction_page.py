@@ -207,7 +207,7 @@ def how(figures: dict[str, Any]) -> str:
     return (
         "`python -m benchmarks.reconstruction --out DIR --page`. Fitted from smoke on black with the true cameras; "
         "PSNR in dB of sRGB on black over the full frame, of single frames at most 50 (`global`: of the mean squared error of "
-        "all of them); volumes and velocities inside true smoke. Scenes with * were never looked at while anything was tuned. "
+        "all of them); volumes and velocities inside true smoke. Nothing was tuned on scenes with *. "
         f"Machine: {machine['processor']}, {machine['cores']} cores, {machine['memory_gib']:.0f} GiB, {machine['system']}; "
         f"{threads} threads, load average {min(loads):.1f} to {max(loads):.1f} at the starts. {versions}. "
         f"{'Weights of the prior' if weights else 'No weights of a prior'} {' and '.join(weights)}".rstrip()

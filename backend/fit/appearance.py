@@ -14,8 +14,7 @@ import numpy as np
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
 from backend.fit.depths import Depths
-from backend.fit.follow import FOLLOW_PLACES, Balance, points_on_rays
-from backend.fit.guide import Guide
+from backend.fit.follow import drawn_level, drawn_near, points_on_rays
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
@@ -32,7 +31,6 @@ FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones m
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
-FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
 
 
 class Appearance:
@@ -73,18 +71,17 @@ class Appearance:
             next_id=np.asarray(0, np.int64),
         )
 
-    def look(self, record: VisualRecord, frame: int, *, consistency: float | None = None) -> tuple[VisualRecord, float]:
-        """The carried record, brought to explain the frame; and the loss. consistency: instead of the config's."""
+    def look(self, record: VisualRecord, frame: int) -> tuple[VisualRecord, float]:
+        """The carried record, brought to explain the frame; and the loss."""
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
-        kept = config.consistency if consistency is None else consistency
         guide = self.depths.guide(frame)
         if guide is not None:
-            record = self._moved_into(record, guide)
+            record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses))
         record = self._calmed(record, layer, view, self.depths.prior(frame))
         if guide is not None:
-            record = self._weighed_by(record, guide)
-        record = self._weighed(record, frame, target, consistency=kept)
+            record = replace(record, optical_masses=drawn_level(guide, record.positions, record.optical_masses))
+        record = self._weighed(record, frame, target, consistency=config.consistency)
         record = self.with_births(record, frame, target)
         record = self._weighed(record, frame, target, consistency=0.0)
         if config.iterations == 0:
@@ -103,28 +100,15 @@ class Appearance:
         masses = record.optical_masses.astype(np.float64)
         common = float(np.exp(np.mean(np.log(np.maximum(masses, 1e-3 * self.unit_mass)))))
         calmed = masses ** (1.0 - CALM_MASS) * common**CALM_MASS
-        rows, columns = _pixels_of(record.positions, view)
+        pixels, _ = view.project(record.positions)
+        columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
+        rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
         seen, opacity = layer[rows, columns, :3], layer[rows, columns, 3:]
         usual = layer[..., :3].sum(axis=(0, 1)) / max(float(layer[..., 3].sum()), 1e-6)
         shown = np.where(opacity > 0.05, seen / np.maximum(opacity, 0.02), usual)
         colors = (1.0 - CALM_COLOR) * record.colors + CALM_COLOR * shown
         positions = depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH)
         return replace(record, positions=positions, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
-
-    def _moved_into(self, record: VisualRecord, guide: Guide) -> VisualRecord:
-        """Positions on their way to the volume's density."""
-        if len(record.positions) == 0:
-            return record
-        balance = Balance(guide, record.positions, record.optical_masses.astype(np.float64))
-        return replace(record, positions=record.positions + FOLLOW_PLACES * balance.displacement())
-
-    def _weighed_by(self, record: VisualRecord, guide: Guide) -> VisualRecord:
-        """Masses on their way to the volume's density."""
-        if len(record.positions) == 0:
-            return record
-        masses = record.optical_masses.astype(np.float64)
-        masses = masses * Balance(guide, record.positions, masses).ratios() ** FOLLOW_MASSES
-        return replace(record, optical_masses=masses.astype(np.float32))
 
     def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
         """Masses after the frame was seen, without the spent and the departed."""
@@ -140,13 +124,9 @@ class Appearance:
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 
-    def _with_room(self, record: VisualRecord, wanted: int) -> tuple[VisualRecord, int]:
-        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting. And how
-        many there is room for now."""
-        kept = self._without_faint(record, wanted - (self.config.num_particles - len(record.positions)))
-        return kept, min(wanted, self.config.num_particles - len(kept.positions))
-
-    def _without_faint(self, record: VisualRecord, lacking: int) -> VisualRecord:
+    def _with_room(self, record: VisualRecord, wanted: int) -> VisualRecord:
+        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting."""
+        lacking = wanted - (self.config.num_particles - len(record.positions))
         if lacking <= 0:
             return record
         order = np.argsort(record.optical_masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(record.positions)))]
@@ -157,7 +137,7 @@ class Appearance:
 
     def with_births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
         """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
-        view = self.scene.views[frame]
+        view, layer = self.scene.views[frame], self.layers[frame]
         splat = renderer.forward(as_gaussians(record), view)
         missing = explain.missing_depth(splat, target)
         missing[missing < 0.02 * max(float(target.max(initial=0.0)), 1e-6)] = 0.0
@@ -165,21 +145,17 @@ class Appearance:
         mass = missing * pixel_mass(view, prior.center_depth)
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))
-        record, count = self._with_room(record, int(total / unit))
+        wanted = int(total / unit)
+        record = self._with_room(record, wanted)
+        count = min(wanted, self.config.num_particles - len(record.positions))
         seed = self.seed + 104729 * frame + 1
         points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=seed)
-        guide = self.depths.guide(frame)
-        if guide is not None:
-            points = points_on_rays(guide, view, pixels, points, seed=seed)
-        return self._with_newborn(record, points, total, frame)
-
-    def _with_newborn(self, record: VisualRecord, points: np.ndarray, total: float, frame: int) -> VisualRecord:
-        """The record with Gaussians at points [N, 3] m that share the mass `total` m^2, in the colours that the frame shows."""
-        count = len(points)
+        guide, count = self.depths.guide(frame), len(points)
         if count == 0:
             return record
-        view, layer = self.scene.views[frame], self.layers[frame]
-        rows, columns = _pixels_of(points, view)
+        if guide is not None:
+            points = points_on_rays(guide, view, pixels, points, seed=seed)
+        rows, columns = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
         seen = layer[rows, columns]
         newborn = {
             "positions": points,
@@ -192,10 +168,3 @@ class Appearance:
         if record.rotations is not None:
             newborn["rotations"] = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         return join(record, **newborn)
-
-
-def _pixels_of(positions: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column [N] of the pixel in which a position is seen, or that of the border next to it."""
-    pixels, _ = view.project(positions)
-    columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
-    return np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1), columns

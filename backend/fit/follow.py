@@ -13,6 +13,7 @@ from backend.fit.guide import Guide
 from backend.geometry.camera import View
 
 FOLLOW_PLACES = 0.3  # share of the flow that turns the particles' density into the volume's, a frame
+FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
 _BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away
@@ -93,6 +94,17 @@ def weighted_poisson(weight: np.ndarray, divergence: np.ndarray) -> np.ndarray:
         slope, before = float((residual * guess).sum()), slope
         step = guess + (slope / before) * step
     return found
+
+
+def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:
+    """Positions [N, 3] m of masses [N] m^2, a share of the way to the volume's density."""
+    return positions + FOLLOW_PLACES * Balance(guide, positions, masses.astype(np.float64)).displacement()
+
+
+def drawn_level(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:
+    """Masses [N] m^2 at positions [N, 3] m, a share of the way to the volume's density; of the type that they had."""
+    exact = masses.astype(np.float64)
+    return (exact * Balance(guide, positions, exact).ratios() ** FOLLOW_MASSES).astype(masses.dtype)
 
 
 def points_on_rays(guide: Guide, view: View, pixels: np.ndarray, otherwise: np.ndarray, *, seed: int) -> np.ndarray:

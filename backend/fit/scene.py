@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from backend.fit.series import Series
 from backend.geometry.camera import View, view_at
 
 MAX_OPACITY = 0.99  # an 8-bit frame cannot tell more: beyond it optical depth is a guess
+LEAST_TURN = math.radians(5.0)  # of the camera about the smoke, for anything to be seen of its depth
 MIN_PARALLAX = 0.02  # share of the mean squared sine between rays below which they do not meet anywhere in particular
 
 FOOT_HEIGHT = 0.05  # of the image
@@ -83,7 +85,9 @@ def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.nd
 
 
 def turned_about(scene: Scene) -> float:
-    """Radians: the largest angle between two frames' cameras as seen from the smoke's anchor."""
+    """Radians: how far the camera goes around the smoke's anchor. Exact where it goes along an arc: from the place that is
+    furthest from the first one to the place that is furthest from that."""
     ways = np.array([view.position for view in scene.views]) - scene.anchor
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
-    return float(np.arccos(np.clip((ways @ ways.T).min(), -1.0, 1.0)))
+    end = ways[np.argmin(ways @ ways[0])]
+    return float(np.arccos(np.clip((ways @ end).min(), -1.0, 1.0)))

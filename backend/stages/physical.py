@@ -19,7 +19,7 @@ from backend.contract.job import PhysicalConfig, PublishedConfig
 from backend.fit import depth_prior, image_motion
 from backend.fit.carry import as_fluid
 from backend.fit.depths import Depths
-from backend.fit.follow import FOLLOW_PLACES, Balance
+from backend.fit.follow import drawn_near
 from backend.fit.guide import Guide
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
@@ -105,7 +105,7 @@ class _Fit:
     def _led(self, record: PhysicalRecord, before: Guide, after: Guide) -> PhysicalRecord:
         """Moved as the volumes say, and a share of the way to their density."""
         positions = before.carried(record.positions, after, seconds=self.scene.seconds_per_frame)
-        positions = positions + FOLLOW_PLACES * Balance(after, positions, record.masses).displacement()
+        positions = drawn_near(after, positions, record.masses)
         velocities = after.velocity_at(positions).astype(np.float64)
         learned = self._learn_buoyancy(record, velocities, np.ones(len(positions)), substeps=1)
         return replace(learned, positions=positions, velocities=velocities)

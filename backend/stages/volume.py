@@ -10,23 +10,17 @@ import numpy as np
 import torch
 
 from backend.contract.cameras import Cameras
-from backend.field.rays import at_voxels, optical_depth
 from backend.fit.pace import stride_of
 from backend.fit.region import find_region
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
+from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
-from backend.geometry.camera import View
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.predict import Prior, Proposal, one_thread
-from backend.prior.window import Stand
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
-SHARPNESS = 1.5  # tuned on puff_front, merging_sources and steady_plume
-_UPDATES = 4  # towards the frame's own optical depth
-_FLOOR = 0.01  # optical depth added to both sides of a ratio
-_MOST_RATIO = 4.0
 
 
 def run(
@@ -87,28 +81,6 @@ def run(
             for frame, proposal in enumerate(proposals, start=first):
                 yield recorded(proposal, frame)
     report.progress(len(layers), len(layers))
-
-
-def sharpened(density: np.ndarray) -> np.ndarray:
-    """Density [X, Y, Z] 1/m to a power, with the largest as it was.
-
-    A network that was taught by squared errors answers with a mean over all that could be: a thin haze lies wherever smoke
-    might have been, and from aside a picture shows all of it. Once the rays have their sums back, the haze has gone to
-    where most smoke is; there may be several such places on a ray.
-    """
-    largest = float(density.max(initial=0.0))
-    return density if largest <= 0.0 else largest * (density / largest) ** SHARPNESS
-
-
-def agreed(density: np.ndarray, stand: Stand, depth: np.ndarray, view: View) -> np.ndarray:
-    """Density [X, Y, Z] 1/m with the optical depth [h, w] that its frame shows in `view`: a few multiplicative updates along
-    the rays (Gordon 1970)."""
-    lattice, own = stand.lattice, stand.seen(view)
-    for _ in range(_UPDATES):
-        ratio = (depth + _FLOOR) / (optical_depth(density, lattice, own) + _FLOOR)
-        ratio = np.clip(ratio, 1.0 / _MOST_RATIO, _MOST_RATIO).astype(np.float32)
-        density = density * at_voxels(ratio, lattice, own, outside=1.0)
-    return density
 
 
 def _halved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

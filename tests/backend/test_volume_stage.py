@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from backend.contract.cameras import Cameras
 from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
 from backend.fit.scene import make_scene, turned_about
+from backend.fit.sharpen import sharpened
 from backend.geometry.camera import view_at
 from backend.prior.network import PlumeNet
 from backend.prior.predict import Prior, save_weights
 from backend.reporting import SilentReport
 from backend.stages import volume
+from benchmarks.tilted_scene import tilted, turn
 from synthetic.sweep import Orbit, orbit_cameras
 
 NUM_FRAMES = 6
@@ -54,17 +55,10 @@ def layers() -> list[np.ndarray]:
     return found
 
 
-def tilted(cameras: Cameras, tilt: np.ndarray) -> Cameras:
-    matrices = [tilt @ np.array(matrix) for matrix in cameras.camera_to_world]
-    return replace(cameras, camera_to_world=tuple(tuple(tuple(float(x) for x in row) for row in matrix) for matrix in matrices))
-
-
 def test_a_tilted_world_gets_the_same_answer_tilted(prior: Prior) -> None:
-    angle = np.radians(25.0)
-    tilt = np.eye(4)
-    tilt[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    tilt = turn(25.0)
     upright = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[]))
-    leaning = list(volume.run(layers(), tilted(CAMERAS, tilt), SilentReport(), prior=prior, done=[]))
+    leaning = list(volume.run(layers(), tilted(CAMERAS, 25.0), SilentReport(), prior=prior, done=[]))
     points = np.random.default_rng(0).normal((0.5, 0.0, 8.0), 2.0, (300, 3))
     for a, b in zip(upright, leaning, strict=True):
         wanted, found = Guide(a), Guide(b)
@@ -135,8 +129,8 @@ def test_how_far_a_camera_goes_around_the_smoke() -> None:
 
 def test_haze_goes_to_where_most_smoke_is() -> None:
     density = np.array([[[4.0, 1.0, 0.0]]], np.float32)
-    np.testing.assert_allclose(volume.sharpened(density), [[[4.0, 0.5, 0.0]]])
-    assert volume.sharpened(np.zeros((2, 2, 2), np.float32)).max() == 0.0
+    np.testing.assert_allclose(sharpened(density), [[[4.0, 0.5, 0.0]]])
+    assert sharpened(np.zeros((2, 2, 2), np.float32)).max() == 0.0
 
 
 def test_the_rays_keep_what_the_frame_shows(prior: Prior) -> None:
