@@ -24,7 +24,7 @@ from backend.contract.errors import BackendError
 from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
-from backend.fit.population import buoyancy_of
+from backend.fit.lift import buoyancy_of, wind_of
 from backend.fit.scene import LEAST_TURN, make_scene, turned_about
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.io import images
@@ -309,18 +309,20 @@ class Pipeline:
             for record in ahead:
                 writer.append(particle_frame(record), is_forecast=True)
             last = fluid[len(fluid) - 1]
-            learned = buoyancy_of(last)
+            buoyancy, doubt = buoyancy_of(last)
+            wind = wind_of(last, drag=self.config.physical.drag)
             with open_stage_file(self.folder.smoke) as file:
                 frame_start = int(file.attrs["frame_start"])  # type: ignore[arg-type]
             info = ParticlesInfo(
                 cameras=read_cameras(self.folder.cameras),
                 gravity=(0.0, 0.0, -9.81),
                 frame_start=frame_start,
-                buoyancy=learned[0],
-                buoyancy_uncertainty=learned[1],
+                buoyancy=_triple(buoyancy),
+                buoyancy_uncertainty=_triple(doubt),
                 fluid={
                     "smoothing_length_m": float(last.smoothing_length),
                     "rest_density": float(last.rest_density),
+                    **{f"wind_{axis}_m_per_second": float(speed) for axis, speed in zip("xyz", wind, strict=True)},
                     **self._drag(),
                 },
                 provenance={
@@ -436,3 +438,8 @@ def _particles_fingerprint(path: Path) -> str | None:
             return particles.info.fingerprint
     except BackendError:
         return None
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)

@@ -1,6 +1,6 @@
 """Train the prior on lessons. Goes on where it was interrupted; every tenth plume is held back and scored.
 
-    .venv/backend/bin/python -m training.train --lessons DIR --out DIR [--passes 20]
+    .venv/backend/bin/python -m training.train --lessons DIR --out DIR [--passes 20] [--start OTHER/state.pt]
 
 OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass; OUT/plumes.npz: the weights as they ship.
 """
@@ -104,6 +104,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--passes", type=int, default=20)
     parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--start", type=Path, help="a state.pt whose net is taught on, perhaps from other lessons")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     paths = sorted(given.lessons.glob("*.npz"))
@@ -113,6 +114,8 @@ def main(arguments: list[str]) -> int:
     net = PlumeNet().to(memory_format=torch.channels_last_3d)
     optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-4)
     first = 0
+    if given.start:
+        net.load_state_dict(torch.load(given.start, weights_only=True)["net"])
     if (given.out / "state.pt").exists():
         state = torch.load(given.out / "state.pt", weights_only=True)
         net.load_state_dict(state["net"])

@@ -57,18 +57,3 @@ def _names(record: AnyRecord) -> set[str]:
     """The arrays of a record that hold a row for each particle."""
     names = {item.name for item in dataclasses.fields(record)} & PER_PARTICLE
     return {name for name in names if getattr(record, name) is not None}
-
-
-def buoyancy_of(record: PhysicalRecord) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """The learned buoyancy and its standard deviation, both m/s^2; infinite doubt is reported as the estimate's own size."""
-    count = float(record.buoyancy_weight)
-    if count < 2.0:
-        return _triple(record.buoyancy), _triple(np.abs(record.buoyancy))
-    mean = record.buoyancy_moment / count
-    variance = np.maximum(record.buoyancy_square / count - mean * mean, 0.0)
-    return _triple(record.buoyancy), _triple(np.sqrt(variance / (count - 1.0)))
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)

@@ -40,6 +40,9 @@ class PhysicalRecord:
     buoyancy_weight: np.ndarray  # [] float64, observations so far
     buoyancy_moment: np.ndarray  # [3] float64 m/s^2, their sum
     buoyancy_square: np.ndarray  # [3] float64 m^2/s^4, the sum of their squares
+    gain: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] float64 m/s, see lift.py, summed over the observations
+    gain_square: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] float64 m^2/s^2, the sum of their squares
+    drift: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] float64 m/s^2, learned force that is not buoyancy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,8 @@ From one frame to the next: position-based fluid step with the buoyancy learned 
 takes its share of the sideways displacement; gradient steps move what still projects to the wrong place; masses
 follow the frame, smoke that nobody explains is born at the depth of the prior, smoke that is gone dies. What the
 frames changed about the velocities is, in the mean, the force that the fluid lacked: buoyancy is solved from it.
-Where volumes are proposed, they lead instead: their velocity carries, their density draws near.
+Where volumes are proposed, they lead instead: their velocity carries, their density draws near, and both together tell
+buoyancy from wind.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from backend.fit.carry import as_fluid
 from backend.fit.depths import Depths
 from backend.fit.follow import drawn_near
 from backend.fit.guide import Guide
+from backend.fit.lift import gain_with_density, shared_out
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VolumeRecord
@@ -107,7 +109,8 @@ class _Fit:
         positions = before.carried(record.positions, after, seconds=self.scene.seconds_per_frame)
         positions = drawn_near(after, positions, record.masses)
         velocities = after.velocity_at(positions).astype(np.float64)
-        learned = self._learn_buoyancy(record, velocities, np.ones(len(positions)), substeps=1)
+        gain = gain_with_density(after.density, after.velocity)
+        learned = self._learn_buoyancy(record, velocities, np.ones(len(positions)), substeps=1, gain=gain)
         return replace(learned, positions=positions, velocities=velocities)
 
     def _filtered(self, record: PhysicalRecord, frame: int) -> PhysicalRecord:
@@ -157,9 +160,15 @@ class _Fit:
         return positions
 
     def _learn_buoyancy(
-        self, record: PhysicalRecord, velocities: np.ndarray, confidence: np.ndarray, substeps: int
+        self,
+        record: PhysicalRecord,
+        velocities: np.ndarray,
+        confidence: np.ndarray,
+        substeps: int,
+        gain: np.ndarray | None = None,
     ) -> PhysicalRecord:
-        """The mean force that the velocities of the optimised positions ask for, all frames so far together."""
+        """The mean force that the velocities of the optimised positions ask for, all frames so far together; of it the part
+        along the gain, where volumes tell that."""
         if not self.config.learn_buoyancy or confidence.sum() <= 0.0:
             return record
         observed = solve_buoyancy(
@@ -172,9 +181,13 @@ class _Fit:
         ).vector
         weight = record.buoyancy_weight + 1.0
         moment = record.buoyancy_moment + observed
+        if gain is not None:
+            record = replace(record, gain=record.gain + gain, gain_square=record.gain_square + gain * gain)
+        buoyancy, drift = shared_out(moment / (weight + BUOYANCY_RIDGE), record.gain)
         return replace(
             record,
-            buoyancy=moment / (weight + BUOYANCY_RIDGE),
+            buoyancy=buoyancy,
+            drift=drift,
             buoyancy_weight=np.asarray(weight),
             buoyancy_moment=moment,
             buoyancy_square=record.buoyancy_square + observed * observed,

@@ -14,6 +14,7 @@ import numpy as np
 from backend.contract.errors import BackendError
 from backend.contract.job import PhysicalConfig
 from backend.fit.carry import as_fluid, carry, with_velocities
+from backend.fit.lift import wind_of
 from backend.fit.population import take
 from backend.fit.replay import births_at_foot, born_again
 from backend.fit.series import Series
@@ -29,7 +30,7 @@ LIFETIME_REACH = 3.0  # heights of the smoke beyond which a particle is dropped
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rollout:
-    """What the artist chose. wind m/s or None for still air; buoyancy: times the learned one; colliders: of the fluid."""
+    """What the artist chose. wind m/s or None for the learned one; buoyancy: times the learned one; colliders: of the fluid."""
 
     num_frames: int
     wind: tuple[float, float, float] | None = None
@@ -61,7 +62,7 @@ def run(
         smoothing_length=float(record.smoothing_length),
         rest_density=float(record.rest_density),
         buoyancy=tuple(rollout.buoyancy * record.buoyancy),
-        wind=rollout.wind or (0.0, 0.0, 0.0),
+        wind=tuple(wind_of(record, drag=config.drag)) if rollout.wind is None else rollout.wind,
         surface_drag=SURFACE_DRAG,
         viscosity=VISCOSITY,
         vorticity_confinement=VORTICITY_CONFINEMENT,
