@@ -42,6 +42,7 @@ def page() -> str:
         *(reconstruction(load("reconstruction"), IMAGES) if has("reconstruction") else []),
         *(tilted_scene(load("tilted_scene")) if has("tilted_scene") else []),
         *whole_path(load("whole_path")),
+        *(clip_length(load("clip_length")) if has("clip_length") else []),
         *input_view(load("view_demo"), load("view_plume"), load("view_wildfire")),
         *forecast(load("forecast_demo"), load("forecast_plume")),
         *rendering(load("render_speed")),
@@ -99,6 +100,33 @@ def whole_path(figures: dict[str, Any]) -> list[str]:
     ]
 
 
+def clip_length(figures: dict[str, Any]) -> list[str]:
+    rows = [
+        [
+            str(run["frames"]),
+            *(f"{run[name]:.0f}" for name in ("seconds", "cpu_seconds")),
+            *(f"{1e3 * run[name] / run['frames']:.0f}" for name in ("seconds", "cpu_seconds")),
+            *(f"{1e3 * run['stages'][name] / run['frames']:.0f}" for name in ("volume", "physical", "visual", "export")),
+            f"{run['peak_gib']:.2f}",
+        ]
+        for run in figures["rows"]
+    ]
+    share = [run["cpu_seconds"] / run["frames"] for run in figures["rows"]]
+    return [
+        "## Longer clips\n",
+        f"`python -m benchmarks.clip_length --json docs/results/clip_length.json`: a steady plume at `{figures['rows'][0]['preset']}`, "
+        f"{figures['rows'][0]['threads']} threads. The dearest frame takes {max(share) / min(share):.2f} times the processor time of "
+        "the cheapest, start of the program included; at most 1.1 is asked.\n",
+        table(
+            [
+                "frames", "seconds", "processor seconds", "ms a frame", "processor ms a frame",
+                *(f"{name}, ms a frame" for name in ("volume", "physical", "visual", "export")), "peak GiB",
+            ],
+            rows,
+        ),
+    ]  # fmt: skip
+
+
 def input_view(*runs: dict[str, Any]) -> list[str]:
     names = ("clip", "preset", "frames", "extraction", "full_db", "smoke_db", "seconds")
     rows = [[*(str(run[name]) for name in names), ", ".join(run["warnings"]) or "none"] for run in runs]
@@ -143,6 +171,7 @@ def rendering(figures: dict[str, Any]) -> list[str]:
             f"{row['backward_ms']:.1f}",
             f"{row['both_fastest_ms']:.1f}",
             f"{row['share_of_peak']:.0%}",
+            f"{row['twin_ratio']:.0f}",
         ]
         for row in figures["rows"]
     ]
@@ -150,8 +179,9 @@ def rendering(figures: dict[str, Any]) -> list[str]:
         "## Renderer\n",
         f"`python -m benchmarks.render_speed --json`: {figures['machine']['threads']} threads, load average "
         f"{figures['machine']['load']:.1f}, optical depth with {figures['features']} features; share of the peak of a "
-        f"float32 matrix product ({figures['product_gflops']:.0f} Gflop/s) in the same run.\n",
-        table(["Gaussians", "size", "forward ms", "backward ms", "both, fastest ms", "share of peak"], rows),
+        f"float32 matrix product ({figures['product_gflops']:.0f} Gflop/s) in the same run; and how many times as long the torch "
+        "twin takes, which sums every Gaussian in every pixel (timed on a part, and scaled).\n",
+        table(["Gaussians", "size", "forward ms", "backward ms", "both, fastest ms", "share of peak", "twin, times"], rows),
     ]
 
 
