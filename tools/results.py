@@ -114,9 +114,10 @@ def clip_length(figures: dict[str, Any]) -> list[str]:
     share = [run["cpu_seconds"] / run["frames"] for run in figures["rows"]]
     return [
         "## Longer clips\n",
-        f"`python -m benchmarks.clip_length --json docs/results/clip_length.json`: a steady plume at `{figures['rows'][0]['preset']}`, "
-        f"{figures['rows'][0]['threads']} threads. The dearest frame takes {max(share) / min(share):.2f} times the processor time of "
-        "the cheapest, start of the program included; at most 1.1 is asked.\n",
+        "`python -m benchmarks.clip_length --json docs/results/clip_length.json`: a steady plume at "
+        f"`{figures['rows'][0]['preset']}`, {figures['rows'][0]['threads']} threads. The dearest frame takes "
+        f"{max(share) / min(share):.2f} times the processor time of the cheapest, start of the program included; at most 1.1 "
+        "is asked.\n",
         table(
             [
                 "frames", "seconds", "processor seconds", "ms a frame", "processor ms a frame",
