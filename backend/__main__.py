@@ -7,7 +7,7 @@
   forecast     the most likely next frames
   simulate     a physical rollout, for looks and editing
   export       the VDB sequence at another voxel size or for other frames
-  evaluate     a finished job against the truth of a benchmark scene
+  evaluate     a finished job against the truth of a benchmark scene or of other cameras
   report       one picture: input, reconstruction, side view
 
 Exit codes: 0 done or cancelled, 2 you can act (one sentence on what is wrong, one on what to do), 1 a defect.
@@ -26,7 +26,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from backend import commands
+from backend import commands, evaluation
 from backend.contract import events
 from backend.contract.errors import EXIT_DEFECT, EXIT_DONE, EXIT_USER, BackendError, Cancelled
 from backend.contract.job import DEVICES, PRESETS
@@ -139,10 +139,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     export.add_argument("--voxel-size", type=float, default=0.0, metavar="M", help="m; 0 as the particles carry")
     export.add_argument("--frames", type=frame_range, metavar="A:B", help="video frames A to B-1; all without it")
 
-    evaluate = command("evaluate", commands.evaluate)
+    evaluate = command("evaluate", evaluation.evaluate)
     _add_job(evaluate)
-    evaluate.add_argument("--truth", type=Path, required=True, metavar="DIR", help="a scene that `synth ship` made")
-    evaluate.add_argument("--out", type=Path, metavar="JSON")
+    evaluation.add_options(evaluate)
 
     report = command("report", commands.report)
     _add_job(report)

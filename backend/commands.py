@@ -176,20 +176,6 @@ def simulate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
     sink.send(events.Done(result=f"{folder.name}/particles.h5", seconds=round(time.monotonic() - began, 3)))
 
 
-def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
-    """A finished job against the truth of a benchmark scene, beside what trivial answers get. JSON, and a table."""
-    from backend.io.atomic import whole_file
-    from backend.score.evaluate import table
-    from backend.score.finished_job import score_job
-    from backend.score.truth_set import read_truth_set
-
-    scores = score_job(JobFolder(options.job), read_truth_set(options.truth))
-    print(table(scores))
-    if options.out is not None:
-        with whole_file(options.out) as part:
-            part.write_text(json.dumps(scores, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
 def report(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
     """One picture: first, middle and last frame; input, reconstruction, and the same smoke from the side."""
     from backend.report import draw_report

@@ -193,7 +193,7 @@ def without_frames(found: Any) -> Any:
     """The same without the figures of single frames."""
     if not isinstance(found, dict):
         return found
-    return {name: without_frames(value) for name, value in found.items() if name != "by_frame_db"}
+    return {name: without_frames(value) for name, value in found.items() if not name.startswith("by_frame_")}
 
 
 def as_text(results: dict[str, Any]) -> str:

@@ -32,10 +32,10 @@ from backend.contract.result import PARTICLES_FILE
 from backend.contract.truth import INPUT_VIEW
 from backend.io.atomic import whole_file
 from backend.io.particles import read_particles
-from backend.score.evaluate import camera_axes
 from backend.score.measures import coded
 from backend.score.particles import ParticlePrediction
 from backend.score.truth_set import TruthSet, read_truth_set
+from backend.score.volumes import camera_axes
 from benchmarks.reconstruction import RESULTS_FILE, SETS, UNTOUCHED
 from tools.contact_sheet import beside
 

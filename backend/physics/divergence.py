@@ -19,6 +19,8 @@ from numba import njit, prange
 from .neighbours import find_neighbours
 
 MIN_NEIGHBOURS = 8
+PUBLISHED_REGULARISATION = 1e-4  # m^2; the supplement gives no value
+RELATIVE_REGULARISATION = 1e-6  # of trace(A^T W A) / 3
 _SIGMA_SHARE = 0.5  # sigma over r; the supplement only says that they are tied
 
 
@@ -73,14 +75,10 @@ def divergence_as_published(
     velocities: np.ndarray,  # [N, 3] m/s
     radius: float,  # m
     *,
-    regularisation: float = 1e-4,  # m^2; the supplement gives no value
+    regularisation: float = PUBLISHED_REGULARISATION,  # m^2
 ) -> Divergence:
     """Eq. 7 and 8 as printed: one absolute lambda, all particles count, isolated ones with 0."""
-    if not regularisation > 0.0:
-        raise ValueError(f"regularisation = {regularisation!r} is not positive")
-    normal, moment, _ = _fit(positions, velocities, radius)
-    jacobians = np.linalg.solve(normal + regularisation / radius**2 * np.eye(3), moment / radius)
-    return _summary(np.trace(jacobians, axis1=1, axis2=2), np.ones(len(normal), bool))
+    return _as_published(_fit(positions, velocities, radius), radius, regularisation)
 
 
 def divergence(
@@ -88,12 +86,37 @@ def divergence(
     velocities: np.ndarray,  # [N, 3] m/s
     radius: float,  # m
     *,
-    regularisation: float = 1e-6,  # share of trace(A^T W A) / 3
+    regularisation: float = RELATIVE_REGULARISATION,  # share of trace(A^T W A) / 3
 ) -> Divergence:
     """Eq. 7 and 8 with a relative lambda, over particles with at least MIN_NEIGHBOURS neighbours."""
+    return _corrected(_fit(positions, velocities, radius), radius, regularisation)
+
+
+def both_divergences(
+    positions: np.ndarray,  # [N, 3] m
+    velocities: np.ndarray,  # [N, 3] m/s
+    radius: float,  # m
+) -> tuple[Divergence, Divergence]:
+    """As published and corrected, for little more than the cost of one: the sums over neighbours are the same."""
+    fit = _fit(positions, velocities, radius)
+    return _as_published(fit, radius, PUBLISHED_REGULARISATION), _corrected(fit, radius, RELATIVE_REGULARISATION)
+
+
+Fit = tuple[np.ndarray, np.ndarray, np.ndarray]  # what _fit returns
+
+
+def _as_published(fit: Fit, radius: float, regularisation: float) -> Divergence:
     if not regularisation > 0.0:
         raise ValueError(f"regularisation = {regularisation!r} is not positive")
-    normal, moment, num_neighbours = _fit(positions, velocities, radius)
+    normal, moment, _ = fit
+    jacobians = np.linalg.solve(normal + regularisation / radius**2 * np.eye(3), moment / radius)
+    return _summary(np.trace(jacobians, axis1=1, axis2=2), np.ones(len(normal), bool))
+
+
+def _corrected(fit: Fit, radius: float, regularisation: float) -> Divergence:
+    if not regularisation > 0.0:
+        raise ValueError(f"regularisation = {regularisation!r} is not positive")
+    normal, moment, num_neighbours = fit
     scale = np.trace(normal, axis1=1, axis2=2) / 3.0
     is_covered = (num_neighbours >= MIN_NEIGHBOURS) & (scale > 0.0)
     ridge = np.where(is_covered, regularisation * scale, 1.0)[:, None, None] * np.eye(3)

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 OURS = "ours"
+LOWER_IS_BETTER = ("dtssd", "lpips", "st_lpips")
 
 
 def best_trivial(answers: Mapping[str, Mapping[str, Any]], figure: str, *, kind: str = "") -> tuple[str, float]:
-    """Name and value of the trivial answer that has most of a figure, among those whose names begin with `kind`."""
+    """Name and value of the trivial answer with the best of a figure, among those whose names begin with `kind`."""
     found = {name: figures[figure] for name, figures in answers.items() if name != OURS and name.startswith(kind)}
-    best = max((name for name, value in found.items() if value is not None), key=lambda name: found[name])
+    choose = min if figure in LOWER_IS_BETTER else max
+    best = choose((name for name, value in found.items() if value is not None), key=lambda name: found[name])
     return best, float(found[best])
 
 

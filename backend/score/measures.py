@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import cv2
 import numpy as np
 
 from backend.io.images import linear_to_srgb
+from backend.score.similarity import Moments
 
 LARGEST_DB = 50.0  # an image of the scoring camera itself would otherwise decide a mean
 SMOKE_OPACITY = 0.02
 _DILATION = 4  # px around the smoke that count as smoke
+
+
+class Target:
+    """A true picture [H, W, 4], linear premultiplied light and opacity, with what every answer is compared with."""
+
+    def __init__(self, picture: np.ndarray) -> None:
+        self.picture = picture
+
+    @cached_property
+    def coded(self) -> np.ndarray:
+        """[H, W, 3] sRGB-coded on black."""
+        return coded(self.picture)
+
+    @cached_property
+    def smoke(self) -> np.ndarray:
+        """[H, W], see smoke_mask."""
+        return smoke_mask(self.picture)
+
+    @cached_property
+    def moments(self) -> Moments:
+        return Moments(self.coded)
 
 
 def coded(picture: np.ndarray) -> np.ndarray:
@@ -27,8 +51,13 @@ def decibels(squared_error: float) -> float:
 def squared_errors(picture: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Mean squares of the coded difference of [H, W, 4] pictures: over the frame, and over the smoke of the truth, dilated;
     the second is NaN where the truth shows no smoke."""
-    squares = np.square(coded(picture) - coded(truth), dtype=np.float64)
-    mask = smoke_mask(truth)
+    return coded_errors(coded(picture), Target(truth))
+
+
+def coded_errors(shown: np.ndarray, target: Target) -> tuple[float, float]:
+    """As squared_errors, of a picture [H, W, 3] that is coded."""
+    squares = np.square(shown - target.coded, dtype=np.float64)
+    mask = target.smoke
     return float(squares.mean()), float(squares[mask].mean()) if mask.any() else float("nan")
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from backend.geometry.camera import View
-from backend.io.particles import Particles
-from backend.physics.divergence import divergence, divergence_as_published
+from backend.io.particles import ParticleFrame, Particles
+from backend.physics.divergence import both_divergences
 from backend.render.picture import picture
 from backend.render.voxelize import voxelize
+from backend.reporting import Report, SilentReport
 from backend.score.truth_set import Volume
 
 
@@ -18,29 +19,38 @@ class ParticlePrediction:
     def __init__(self, particles: Particles) -> None:
         self._particles = particles
         self._start = particles.info.frame_start
+        self._kept: tuple[int, ParticleFrame] | None = None
         self.num_frames = self._start + particles.num_frames + particles.num_forecast
 
     def picture(self, view: View, frame: int) -> np.ndarray:
-        return picture(self._particles.frame(frame - self._start), view)
+        return picture(self._at(frame), view)
 
     def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        grids = voxelize(self._particles.frame(frame - self._start), like.lattice)
+        grids = voxelize(self._at(frame), like.lattice)
         return grids["density"], grids["velocity"]
 
+    def _at(self, frame: int) -> ParticleFrame:
+        """The particles of a frame; those that were asked for last are kept, for a frozen one is asked for again and again."""
+        if self._kept is None or self._kept[0] != frame:
+            self._kept = frame, self._particles.frame(frame - self._start)
+        return self._kept[1]
 
-def mean_divergence(particles: Particles) -> dict[str, float]:
+
+def mean_divergence(particles: Particles, *, report: Report | None = None) -> dict[str, float]:
     """Mean |div v| over the Gaussians within one smoothing length, 1/s, as published and corrected, and the share of them
     that the corrected one counts; means over the fitted frames. A figure that no frame gives is left out."""
+    report = report or SilentReport()
     rows: dict[str, list[float]] = {"as_published": [], "corrected": [], "coverage": []}
     radius = particles.info.fluid["smoothing_length_m"]
     for index in range(particles.num_frames):
+        report.progress(index, particles.num_frames)
         frame = particles.frame(index)
         if frame.count:
-            velocities = frame.velocities.astype(np.float64)
-            rows["as_published"].append(divergence_as_published(frame.positions, velocities, radius).mean_absolute)
-            found = divergence(frame.positions, velocities, radius)
-            rows["corrected"].append(found.mean_absolute)
-            rows["coverage"].append(found.coverage)
+            published, corrected = both_divergences(frame.positions, frame.velocities, radius)
+            rows["as_published"].append(published.mean_absolute)
+            rows["corrected"].append(corrected.mean_absolute)
+            rows["coverage"].append(corrected.coverage)
+    report.progress(particles.num_frames, particles.num_frames)
     return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items() if np.isfinite(values).any()}
 
 

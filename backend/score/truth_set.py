@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import av
 import h5py
@@ -37,6 +38,44 @@ class Volume:
         return Lattice(origin=(x, y, z), voxel_size=self.voxel_size, shape=(i, j, k))
 
 
+class Pictures(Protocol):
+    """Some pictures of one size, [H, W, 4] float32 each, read when they are asked for or all there."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Any: ...
+
+
+class Truth(Protocol):
+    """What a reconstruction is scored on. frames: of each view, the video frames that there are pictures of, in order, the
+    input's first; num_seen: how many of them a method may see; future_views: those whose forecast is scored."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def num_seen(self) -> int: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def frames(self) -> dict[str, list[int]]: ...
+
+    @property
+    def future_views(self) -> Sequence[str]: ...
+
+    def view(self, name: str, frame: int) -> View: ...
+
+    def pictures(self, name: str) -> Pictures:
+        """Of each of frames[name] [H, W, 4] float32 smoke on black: linear light premultiplied, and opacity."""
+        ...
+
+    def volume_frames(self) -> list[int]: ...
+
+    def volume(self, frame: int) -> Volume: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthSet:
     """A packed scene. frames: of each view, the video frames that there are pictures of."""
@@ -48,6 +87,10 @@ class TruthSet:
     fps: float
     frames: dict[str, list[int]]
     cameras: dict[str, Cameras]
+
+    @property
+    def future_views(self) -> Sequence[str]:
+        return (INPUT_VIEW, "nvs")
 
     def view(self, name: str, frame: int) -> View:
         return view_at(self.cameras[name], 0 if self.cameras[name].is_still else frame)

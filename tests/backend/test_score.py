@@ -13,8 +13,10 @@ from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.score import baselines, measures
 from backend.score.compare import best_trivial, lead
-from backend.score.evaluate import camera_axes, evaluate, table
+from backend.score.evaluate import evaluate
+from backend.score.text_table import table
 from backend.score.truth_set import Volume, read_truth_set
+from backend.score.volumes import camera_axes
 
 SHIPPED = Path(__file__).resolve().parents[2] / "synthetic" / "bench"
 SCENES = sorted(path.name for path in SHIPPED.glob("*"))
@@ -192,6 +194,7 @@ class TinyTruth:
 
     name, num_frames, num_seen, fps = "ball", 8, 6, 2.0
     frames: ClassVar = {"input": list(range(8)), "nvs": [0, 2, 4, 6], "side": [0, 5], "back": [0, 5]}
+    future_views = ("input", "nvs")
     azimuths: ClassVar = {"nvs": -90.0, "side": 30.0, "back": 90.0}
 
     def view(self, name: str, frame: int) -> View:

@@ -1,0 +1,45 @@
+"""The command `evaluate`: a finished job against what is known to be true. Heavy imports wait until it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from backend.contract import events
+from backend.events_out import EventSink, StageReport, StopRequest
+from backend.io.job_folder import JobFolder
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """All but --job."""
+    parser.add_argument(
+        "--truth", type=Path, required=True, metavar="DIR", help="a scene that `synth ship` made, or a set of cameras"
+    )
+    parser.add_argument("--out", type=Path, metavar="JSON")
+    parser.add_argument("--lpips", type=Path, nargs="+", metavar="FILE", help="weights of LPIPS or ST-LPIPS, kept by torch.save")
+
+
+def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
+    """A finished job against the truth of a benchmark scene or of any set of cameras, beside what trivial answers get.
+
+    Prints a table; docs/evaluate.md says how to read it, and how a set of cameras lies in its folder.
+    """
+    from backend.io.atomic import write_text
+    from backend.score.finished_job import open_job, scores_of
+    from backend.score.perceptual import read_perceptual
+    from backend.score.text_table import table
+    from backend.score.truth_set import read_truth_set
+
+    def begin(part: str) -> StageReport:
+        sink.send(events.Stage(name=part, index=0, count=1))
+        return StageReport(part, sink, stop)
+
+    truth = read_truth_set(options.truth)
+    perceptual = read_perceptual(options.lpips) if options.lpips else None
+    with open_job(JobFolder(options.job), truth) as job:
+        scores = scores_of(job, truth, perceptual=perceptual, begin=begin)
+    sink.close()
+    print(table(scores))
+    if options.out is not None:
+        write_text(options.out, json.dumps(scores, indent=1, allow_nan=False) + "\n")
