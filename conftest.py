@@ -6,6 +6,8 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import pytest
+
 CHECKOUT = Path(__file__).resolve().parent
 
 if str(CHECKOUT) not in sys.path:
@@ -22,3 +24,10 @@ if "wildsmoke" not in sys.modules and (CHECKOUT / "__init__.py").exists():
     module = importlib.util.module_from_spec(spec)
     sys.modules["wildsmoke"] = module
     spec.loader.exec_module(module)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Here, because pytest asks only the topmost conftest for options."""
+    group = parser.getgroup("extremes", "tests/extremes")
+    group.addoption("--extremes", choices=("short", "full"), default="short", help="full: a million particles, 8K, long rollouts")
+    group.addoption("--extremes-table", metavar="JSON", help="write what was tried and what was measured")

@@ -16,10 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
+from backend.contract.errors import BackendError
+
 _CHUNK = 2048  # particles binned by one thread at a time
 _MAX_CHUNKS = 16
 _FINE = 4  # cells along z in the width of one
 _SLACK = 1e-6  # share by which a cell is wider than the radius, so that rounding cannot skip a cell
+_MOST_PAIRS = 4e9  # within single cells; the lists would take some 10 GB
 MAX_RANGES = 18  # of candidates about a point: nine columns, each cut at most once by the seam
 
 
@@ -193,8 +196,18 @@ def find_neighbours(
     positions: np.ndarray,  # [N, 3] m, finite
     radius: float,  # m
 ) -> Neighbours:
-    """All pairs closer than `radius`; a pair is in both lists. The order within a list is fixed by the positions."""
+    """All pairs closer than `radius`; a pair is in both lists. The order within a list is fixed by the positions.
+
+    Raises BackendError where so many particles crowd that their pairs fit into no memory.
+    """
     grid = build_grid(positions, radius)
+    in_cell = np.diff(grid.starts).astype(np.float64)
+    if float(in_cell @ in_cell) > _MOST_PAIRS:
+        raise BackendError(
+            "particles_too_crowded",
+            f"{int(in_cell.max())} of {len(positions)} particles crowd into one smoothing length.",
+            hint="Ask for fewer particles, or for frames that show more smoke.",
+        )
     num_tasks = max(1, min(256, len(positions) // 64))
     row_starts = np.zeros(len(positions) + 1, np.int64)
     shared = (radius, grid.cell_size, grid.shape, grid.starts, grid.order, grid.coordinates, num_tasks)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from backend.geometry.camera import View
 
-from . import projection, splat
+from . import splat
 from .gaussians import Gaussians
 
 
@@ -22,7 +22,7 @@ def render(
     features: Tensor,  # [N, K]
     view: View,
     *,
-    near: float = projection.NEAR,
+    near: float | None = None,
 ) -> Tensor:
     """[1 + K, H, W] float32 on the CPU: as torch_twin.render, by the numba kernels. First derivatives only."""
     return _Render.apply(positions, scales, rotations, optical_masses, features, view, near)  # type: ignore[return-value]
@@ -38,7 +38,7 @@ class _Render(torch.autograd.Function):
         optical_masses: Tensor,
         features: Tensor,
         view: View,
-        near: float,
+        near: float | None,
     ) -> Tensor:
         inputs = (positions, scales, rotations, optical_masses, features)
         arrays = [tensor.detach().cpu().numpy() for tensor in inputs]

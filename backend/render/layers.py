@@ -22,7 +22,7 @@ from .gaussians import Gaussians, require_finite
 from .layer_kernels import differentiate_layers, draw_layers
 from .projection_gradient import Found, no_gradients, project_backward
 from .pyramid import make_pyramid
-from .splat import FAINTEST, Geometry, Gradients, check_view, inputs_of, require_image
+from .splat import FAINTEST, Geometry, Gradients, checked_near, inputs_of, require_image
 from .splat_kernels import NUM_SUMS, copy_rows, gather, scaled_into
 
 
@@ -39,9 +39,9 @@ class Layers:
     geometry: Geometry
 
 
-def forward(gaussians: Gaussians, view: View, features: np.ndarray, *, near: float = projection.NEAR) -> Layers:
-    """Draws `features` [N, K], for example colours. near: depth in m before which nothing is seen."""
-    check_view(view, near)
+def forward(gaussians: Gaussians, view: View, features: np.ndarray, *, near: float | None = None) -> Layers:
+    """Draws `features` [N, K], for example colours. near: depth in m before which nothing is seen (None: fits)."""
+    near = checked_near(gaussians, view, near)
     require_finite("features", features, (len(gaussians), features.shape[1] if features.ndim == 2 else -1))
     depth = view.to_camera(np.asarray(gaussians.positions, np.float64))[:, 2]
     order = np.argsort(depth, kind="stable")

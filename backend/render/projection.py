@@ -20,7 +20,8 @@ from numba import njit, prange
 
 from backend.geometry.camera import View
 
-NEAR = 0.01  # m; splats fade in from here to twice this depth
+NEAR = 0.01  # m, at most; splats fade in from the near plane to twice its depth
+NEAR_SHARE = 0.02  # of the distance of particles nearer than half a metre: a small scene has its near plane nearer too
 TANGENT_LIMIT = 1.3  # of the tangent of half the field of view: where the Jacobian is held
 DILATION = 0.3  # px^2 added to both variances: no splat is thinner than the sampling can show
 CUT = 12.5  # splats end where their exponent is -CUT; the share of mass outside is exp(-CUT) = 3.7e-6
@@ -46,6 +47,17 @@ class Lens(NamedTuple):  # a tuple, because numba takes those
     low_y: float
     high_y: float
     near: float  # m
+
+
+def near_plane(
+    positions: np.ndarray,  # [N, 3] m
+    view: View,
+) -> float:  # m
+    """NEAR, or less before a small scene: NEAR_SHARE of the root mean square distance, so that a scene may have any scale."""
+    distances = view.to_camera(positions)
+    with np.errstate(over="ignore"):
+        mean_square = float(np.einsum("ni,ni->", distances, distances)) / max(len(distances), 1)
+    return min(NEAR, NEAR_SHARE * math.sqrt(mean_square)) if mean_square > 0.0 else NEAR
 
 
 def make_lens(view: View, near: float) -> Lens:

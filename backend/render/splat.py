@@ -69,9 +69,9 @@ class Gradients:
     camera_rotation: np.ndarray  # [3] float64, 1/radian
 
 
-def forward(gaussians: Gaussians, view: View, *, features: np.ndarray | None = None, near: float = projection.NEAR) -> Splat:
-    """Draws the optical depth and `features` [N, K] (None: K = 0). near: depth in m before which nothing is seen."""
-    check_view(view, near)
+def forward(gaussians: Gaussians, view: View, *, features: np.ndarray | None = None, near: float | None = None) -> Splat:
+    """Draws the optical depth and `features` [N, K] (None: K = 0). near: depth in m before which nothing is seen (None: fits)."""
+    near = checked_near(gaussians, view, near)
     geometry = _geometry(gaussians, view, near)
     return _drawn(gaussians, view, geometry, gaussians.optical_masses, features)
 
@@ -123,6 +123,12 @@ def adjoint_mass(splat: Splat, image_grad: np.ndarray) -> np.ndarray:
     sums = np.empty((len(splat.gaussians), 1))
     gather(slots, bins.slot_starts, geometry.num_chunks, sums)
     return sums[:, 0] * geometry.splats[:, 5] * geometry.splats[:, 6] * scale
+
+
+def checked_near(gaussians: Gaussians, view: View, near: float | None) -> float:
+    """`near`, or what fits the scene. Raises ValueError where it or the view is no camera's."""
+    check_view(view, projection.NEAR if near is None else near)
+    return projection.near_plane(np.asarray(gaussians.positions, np.float64), view) if near is None else near
 
 
 def check_view(view: View, near: float) -> None:
