@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 
 from backend.contract import events
+from backend.contract.result import read_result
+from backend.contract.truth import INPUT_VIEW
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.io.job_folder import JobFolder
 
@@ -16,6 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--truth", type=Path, required=True, metavar="DIR", help="a scene that `synth ship` made, or a set of cameras"
     )
+    parser.add_argument("--input", default=INPUT_VIEW, metavar="NAME", help="of a set of cameras: the one that was fitted")
     parser.add_argument("--out", type=Path, metavar="JSON")
     parser.add_argument("--lpips", type=Path, nargs="+", metavar="FILE", help="weights of LPIPS or ST-LPIPS, kept by torch.save")
 
@@ -28,14 +31,15 @@ def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
     from backend.io.atomic import write_text
     from backend.score.finished_job import open_job, scores_of
     from backend.score.perceptual import read_perceptual
+    from backend.score.read_truth import read_truth
     from backend.score.text_table import table
-    from backend.score.truth_set import read_truth_set
 
     def begin(part: str) -> StageReport:
         sink.send(events.Stage(name=part, index=0, count=1))
         return StageReport(part, sink, stop)
 
-    truth = read_truth_set(options.truth)
+    num_seen = read_result(options.job).num_frames
+    truth = read_truth(options.truth, num_seen=num_seen, input_name=options.input)
     perceptual = read_perceptual(options.lpips) if options.lpips else None
     with open_job(JobFolder(options.job), truth) as job:
         scores = scores_of(job, truth, perceptual=perceptual, begin=begin)

@@ -26,19 +26,20 @@ def table(scores: dict[str, Any]) -> str:
     """A row for each view and answer, then what is no picture."""
     views = {name: found for name, found in scores.items() if isinstance(found, dict) and OURS in found}
     columns = {key: column for key, column in COLUMNS.items() if any(key in found[OURS] for found in views.values())}
-    lines = [f"{scores['scene']:<14} {'answer':<22} " + " ".join(f"{heading:>8}" for heading, _ in columns.values())]
+    wide = max(14, *(len(view) for view in views))
+    lines = [f"{scores['scene']:<{wide}} {'answer':<22} " + " ".join(f"{heading:>8}" for heading, _ in columns.values())]
     for view, answers in views.items():
         for answer, found in answers.items():
             cells = (_number(found.get(key), digits) for key, (_, digits) in columns.items())
-            lines.append(f"{view:<14} {answer:<22} " + " ".join(f"{cell:>8}" for cell in cells))
+            lines.append(f"{view:<{wide}} {answer:<22} " + " ".join(f"{cell:>8}" for cell in cells))
     for view, found in scores.get("motion", {}).items():
         if found:
-            lines.append(f"{view:<14} tOF {found['tof']} px, of an answer that never moves {found['still']}")
+            lines.append(f"{view:<{wide}} tOF {found['tof']} px, of an answer that never moves {found['still']}")
     for name in ("volume", "prior_volume", "divergence", "buoyancy"):
         found = scores.get(name, {})
         figures = {key: value for key, value in found.items() if key != "velocity"} | found.get("velocity", {})
-        lines += [f"{name:<14} {key} {value}" for key, value in figures.items()]
-    lines += [f"{'not measured':<14} {name}: {reason}" for name, reason in scores.get("not_measured", {}).items()]
+        lines += [f"{name:<{wide}} {key} {value}" for key, value in figures.items()]
+    lines += [f"{'not measured':<{wide}} {name}: {reason}" for name, reason in scores.get("not_measured", {}).items()]
     return "\n".join(lines)
 
 
