@@ -16,6 +16,8 @@ from .errors import BackendError
 
 Matrix = tuple[tuple[float, ...], ...]  # 4x4
 _ROTATION_TOLERANCE = 1e-3
+_LARGEST = 1e12  # of any number; beyond it sums of squares of metres lose the picture
+_LARGEST_SIDE = 32_768  # px; a count beyond it is damage, and must not ask for memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +76,8 @@ def parse_cameras(text: str, *, name: str = "cameras.json", num_frames: int | No
             raise _bad(name, f"has {key} = {numbers[key]:g}, which is not positive")
     if not (width.is_integer() and height.is_integer()):
         raise _bad(name, "has a size that is not whole pixels")
+    if max(width, height) > _LARGEST_SIDE:
+        raise _bad(name, f"is for pictures of {width:g} x {height:g}; at most {_LARGEST_SIDE} a side can be drawn")
     matrices = data.get("camera_to_world")
     if not isinstance(matrices, list) or not matrices:
         raise _bad(name, "has no camera_to_world")
@@ -106,7 +110,7 @@ def _number(name: str, data: dict[str, Any], key: str) -> float:
     value = data.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _bad(name, f"has no number {key}")
-    if not math.isfinite(value) or abs(value) > 1e12:
+    if not math.isfinite(value) or abs(value) > _LARGEST:
         raise _bad(name, f"has a {key} that is not finite")
     return float(value)
 
@@ -117,6 +121,8 @@ def _matrix(name: str, frame: int, matrix: Any) -> Matrix:
         raise _bad(name, f"has a {where} that is not 4x4")
     if any(isinstance(v, bool) or not isinstance(v, (int, float)) or not math.isfinite(v) for row in matrix for v in row):
         raise _bad(name, f"has NaN, infinity or no number in {where}")
+    if any(abs(v) > _LARGEST for row in matrix for v in row):
+        raise _bad(name, f"has a number beyond {_LARGEST:g} in {where}")
     rows = tuple(tuple(float(v) for v in row) for row in matrix)
     a, b, c = (row[:3] for row in rows[:3])
     determinant = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])

@@ -124,7 +124,12 @@ def _on_black(
 
     samples = [layer(frames[k]) for k in _spread(len(frames), _SAMPLES)]
     measured["opaque_luminance"] = black.peak
-    _check_smoke(samples, measured, "the picture is black throughout")
+    detail = (
+        "the picture is black throughout"
+        if black.level <= on_black.MAX_BLACK_LEVEL
+        else "nothing is brighter than the background"
+    )
+    _check_smoke(samples, measured, detail)
     return SmokeLayer(
         mode="on_black",
         reason=reason,

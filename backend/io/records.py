@@ -63,10 +63,10 @@ class RecordFolder(Generic[Record]):
 
 
 class RecordFile(Generic[Record]):
-    """The frames of a finished stage, read one at a time."""
+    """The frames of a finished stage, read one at a time. Raises BackendError where there is no such file."""
 
     def __init__(self, path: Path, record_type: type[Record]) -> None:
-        self._file = h5py.File(path, "r")
+        self._file = open_stage_file(path)
         self._type = record_type
 
     def __len__(self) -> int:

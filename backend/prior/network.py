@@ -115,7 +115,9 @@ def seen_at(images: Tensor, matrices: Tensor, voxels: Tensor) -> Tensor:
     flat = voxels.reshape(batch * count, -1, 3)
     seen = flat @ matrices[..., :3].reshape(-1, 3, 3).transpose(1, 2) + matrices[..., 3].reshape(-1, 1, 3)
     size = torch.tensor([width, height], dtype=torch.float32, device=images.device)
-    grid = seen[..., :2] * (2 / size) * seen[..., 2:].clamp_min(1e-3).reciprocal() + (1 / size - 1)
+    # Depth is in the scene's metres, whatever they are: nearer than a thousandth of a voxel counts as that.
+    least = 1e-3 * matrices[..., 2, :3].norm(dim=-1).reshape(-1, 1, 1)
+    grid = seen[..., :2] * (2 / size) * torch.maximum(seen[..., 2:], least).reciprocal() + (1 / size - 1)
     found = functional.grid_sample(images.reshape(-1, 1, height, width), grid[:, None], align_corners=False)
     return found.reshape(batch, count, *shape)
 

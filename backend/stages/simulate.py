@@ -25,6 +25,8 @@ from backend.reporting import Report
 SURFACE_DRAG = 3.0  # 1/s, where smoke borders on air: shears the edge of a plume
 VISCOSITY = 1.0  # 1/s
 VORTICITY_CONFINEMENT = 2.0  # 1/s
+MOST_FRAMES = 10_000
+LARGEST = 1e6  # m/s of wind, times the learned buoyancy; more is a mistake
 LIFETIME_REACH = 3.0  # heights of the smoke beyond which a particle is dropped
 
 
@@ -47,7 +49,8 @@ def run(
     *,
     seconds: float,
 ) -> Iterator[VisualRecord]:
-    """Yields rollout.num_frames records behind the last frame. seconds: of a frame."""
+    """Yields rollout.num_frames records behind the last frame. seconds: of a frame. Raises BackendError."""
+    _check(rollout)
     record, look = fluid[len(fluid) - 1], seen[len(seen) - 1]
     if len(record.positions) == 0:
         raise BackendError("nothing_to_simulate", "The last fitted frame holds no smoke.", hint="Fit other frames.")
@@ -83,3 +86,18 @@ def run(
         look = take(look, np.linalg.norm(look.positions - middle, axis=1) < reach)
         yield with_velocities(look, record)
     report.progress(rollout.num_frames, rollout.num_frames)
+
+
+def _check(rollout: Rollout) -> None:
+    """Raises BackendError where a number that the artist chose is none, or beyond all measure."""
+    if not 1 <= rollout.num_frames <= MOST_FRAMES:
+        raise BackendError(
+            "bad_frame_range", f"{rollout.num_frames} frames cannot be simulated.", hint=f"Give 1 to {MOST_FRAMES} frames."
+        )
+    for name, values in (("wind", rollout.wind or ()), ("buoyancy", (rollout.buoyancy,))):
+        if not all(abs(value) <= LARGEST for value in values):
+            raise BackendError(
+                "bad_rollout",
+                f"A {name} of {', '.join(f'{value:g}' for value in values)} cannot be simulated.",
+                hint=f"Give numbers of at most {LARGEST:g}.",
+            )
