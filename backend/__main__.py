@@ -1,6 +1,6 @@
 """The backend's command line. `python -m backend COMMAND --help` tells more of each.
 
-  inspect      what a clip needs and why; nothing is fitted
+  inspect      what a clip requires and why, what each preset costs; nothing is fitted
   reconstruct  from a video to particles and a VDB sequence, in a job folder
   run          the job in DIR/job.json, events as JSON lines (what the add-on calls)
   render       the fitted or forecast smoke from any camera
@@ -39,7 +39,7 @@ LONG_COMMANDS = ("run", "reconstruct", "forecast", "simulate")  # they send even
 def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     is_piped = options.command == "run" or (options.command in LONG_COMMANDS and not sys.stdout.isatty())
-    sink: EventSink = PipeSink() if is_piped else TerminalSink()
+    sink: EventSink = PipeSink() if is_piped else TerminalSink(getattr(options, "job", None))
     stop = StopRequest()
     if options.command == "run":
         watch_standard_input(stop, sink)
@@ -105,13 +105,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     inspect.add_argument("video")
     inspect.add_argument("--json", action="store_true", help="as JSON")
     _add_settings(inspect)
+    _add_clip(inspect)
 
     reconstruct = command("reconstruct", commands.reconstruct)
     reconstruct.add_argument("video", help="a video, a folder of images, or a pattern such as shot_%%04d.png")
     _add_job(reconstruct)
     _add_settings(reconstruct)
-    reconstruct.add_argument("--cameras", help="cameras.json of the clip")
-    reconstruct.add_argument("--frames", type=frame_range, metavar="A:B", help="frames A to B-1 only")
+    _add_clip(reconstruct)
     reconstruct.add_argument("--device", choices=DEVICES, default="auto")
 
     _add_job(command("run", commands.run))
@@ -129,7 +129,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     simulate = command("simulate", commands.simulate)
     _add_job(simulate)
     simulate.add_argument("--frames", type=int, required=True, metavar="N")
-    simulate.add_argument("--wind", type=vector, default=None, metavar="X,Y,Z", help="m/s")
+    simulate.add_argument("--wind", type=vector, default=None, metavar="X,Y,Z", help="m/s; the learned one without it")
     simulate.add_argument("--buoyancy", type=float, default=1.0, metavar="S", help="times the learned one")
     simulate.add_argument("--collider", action="append", default=[], metavar="MESH", help="an .obj the smoke flows around")
 
@@ -157,6 +157,11 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     # Not argparse's choices: an unknown preset is answered by the contract, the same in every front end.
     parser.add_argument("--preset", default="preview", help=" | ".join(PRESETS))
     parser.add_argument("--set", dest="overrides", action="append", default=[], type=setting, metavar="section.field=value")
+
+
+def _add_clip(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--cameras", help="cameras.json of the clip")
+    parser.add_argument("--frames", type=frame_range, metavar="A:B", help="frames A to B-1 only")
 
 
 def setting(text: str) -> tuple[str, str]:

@@ -11,21 +11,29 @@ from backend import __version__
 from backend.contract import events
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.errors import BackendError
-from backend.contract.job import Job, checked_job, override, preset_config, read_job
+from backend.contract.job import Job, checked_job, override, read_job
 from backend.contract.result import RESULT_FILE, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.io.job_folder import JobFolder
 
 
 def inspect_clip(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:
-    """What a clip needs and why: each decision with its reason and the quantity behind it. Nothing is fitted."""
-    from backend.io.video import open_clip
-    from backend.stages import inspect
+    """What a clip requires and why, and what each preset will cost: minutes, memory, quality. Nothing is fitted."""
+    from backend.outlook import outlook_of
 
-    config = override(preset_config(options.preset), dict(options.overrides))
-    with open_clip(options.video, frame_rate=config.frames.frame_rate) as clip:
-        decisions = inspect.inspect(clip, config)
-    print(inspect.to_json(decisions) if options.json else inspect.to_text(decisions))
+    start, end = options.frames or (None, None)
+    job = checked_job(
+        Job(
+            video=absolute_video(options.video),
+            preset=options.preset,
+            cameras=None if options.cameras is None else str(Path(options.cameras).resolve()),
+            frame_start=start,
+            frame_stop=end,
+            overrides=dict(options.overrides),
+        )
+    )
+    outlook = outlook_of(job, StageReport("inspect", sink, stop))
+    print(outlook.to_json() if options.json else outlook.to_text())
 
 
 def reconstruct(options: argparse.Namespace, sink: EventSink, stop: StopRequest) -> None:

@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import IO, Protocol
 
 from rich.console import Console
@@ -13,7 +14,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from backend.contract import events
+from backend.contract.decisions import read_decisions
 from backend.contract.errors import Cancelled
+from backend.contract.estimates import read_estimate
+from backend.estimate.time_left import TimeLeft
 
 STOP_AFTER_ORPHANED = 0.8  # seconds a step may still take once Blender is gone; all must be over within two
 STOP_AFTER_CANCEL = 5.0  # seconds a step may still take after a cancel
@@ -55,9 +59,13 @@ class PipeSink:
 
 
 class TerminalSink:
-    """A line a stage with its bar and time left."""
+    """What was decided and how long it may take, then a line a stage with its bar and the time left, in it and in all.
 
-    def __init__(self) -> None:
+    job: the folder whose files the events name, None where there is none.
+    """
+
+    def __init__(self, job: Path | None = None) -> None:
+        self._job = job
         self._console = Console(stderr=True, highlight=False)
         self._progress = Progress(
             TextColumn("{task.description:<10}"),
@@ -80,7 +88,14 @@ class TerminalSink:
                 self._task = self._progress.add_task(event.name, total=None, left="")
             case events.Progress() if self._task is not None:
                 left = "" if event.seconds_left is None else f"{event.seconds_left:.0f} s left"
+                if event.job_seconds_left is not None:
+                    left += f", {event.job_seconds_left:.0f} s in all"
                 self._progress.update(self._task, completed=event.step, total=event.total, left=left)
+            case events.Artifact(kind="decisions") if self._job is not None:
+                self._console.print(escape(read_decisions(self._job).to_text()))
+            case events.Artifact(kind="estimate") if self._job is not None:
+                text = (self._job / event.path).read_text(encoding="utf-8")
+                self._console.print(f"expected  {escape(read_estimate(text).to_text())}")
             case events.Warning():
                 self._console.print(f"[yellow]warning:[/yellow] {escape(event.message)}")
             case events.Done():
@@ -139,26 +154,30 @@ def watch_standard_input(stop: StopRequest, sink: EventSink) -> None:
 class StageReport:
     """A stage's Report: turns steps into progress events with the time left, at most ten a second."""
 
-    def __init__(self, stage: str, sink: EventSink, stop: StopRequest) -> None:
+    def __init__(self, stage: str, sink: EventSink, stop: StopRequest, *, time_left: TimeLeft | None = None) -> None:
         self._stage = stage
         self._sink = sink
         self._stop = stop
         self.warnings: list[dict[str, str]] = []
-        self._began: tuple[float, int] | None = None
+        if time_left is None:
+            time_left = TimeLeft({})
+            time_left.begin(stage, time.monotonic())
+        self._time_left = time_left
         self._sent = 0.0
 
     def progress(self, step: int, total: int, **metrics: float) -> None:
         self._stop.check()
         now = time.monotonic()
-        if self._began is None:
-            self._began = (now, step)
+        left, job_left = self._time_left.left(step, total, now)
         if step < total and now - self._sent < 1.0 / events.MAX_PROGRESS_PER_SECOND:
             return
         self._sent = now
-        done = step - self._began[1]
-        left = (now - self._began[0]) / done * (total - step) if done > 0 else None
         finite = {name: float(value) for name, value in metrics.items() if abs(float(value)) < float("inf")}
-        self._sink.send(events.Progress(stage=self._stage, step=step, total=total, seconds_left=left, metrics=finite))
+        self._sink.send(
+            events.Progress(
+                stage=self._stage, step=step, total=total, seconds_left=left, job_seconds_left=job_left, metrics=finite
+            )
+        )
 
     def warning(self, code: str, message: str) -> None:
         entry = {"code": code, "message": message}

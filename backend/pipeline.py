@@ -1,6 +1,6 @@
 """The pipeline: alone knows the order of the stages, alone reads and writes their files, resumes and stops.
 
-video -> frames -> smoke layer -> cameras -> (volumes) -> physical particles -> visual particles -> forecast -> export
+video -> decisions -> frames -> smoke layer -> cameras -> (volumes) -> physical -> visual particles -> forecast -> export
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,15 @@ import numpy as np
 from backend import __version__
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
+from backend.contract.decisions import DECISIONS_FILE, read_decisions
 from backend.contract.errors import BackendError
+from backend.contract.estimates import ESTIMATE_FILE, Estimate, read_estimate
 from backend.contract.job import Config, Job, read_job
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
+from backend.estimate.predict import estimate
+from backend.estimate.time_left import TimeLeft
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit.lift import buoyancy_of, wind_of
-from backend.fit.scene import LEAST_TURN, make_scene, turned_about
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
@@ -37,9 +40,9 @@ from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_s
 from backend.io.video import Clip, open_clip
 from backend.prior.weights import WEIGHTS, weights_fingerprint
 from backend.stages import cameras as cameras_stage
-from backend.stages import export, forecast, frames, physical, smoke, visual
+from backend.stages import export, forecast, frames, inspect, physical, smoke, visual
 
-STAGES = ("frames", "smoke", "cameras", "volume", "physical", "visual", "forecast", "export")
+STAGES = ("inspect", "frames", "smoke", "cameras", "volume", "physical", "visual", "forecast", "export")
 
 
 def stages_of(config: Config) -> tuple[str, ...]:
@@ -90,16 +93,18 @@ class Pipeline:
         self.config: Config = job.config()
         self.stages = stages_of(self.config)
         self.weights = weights
-        self.weights_mark = weights_fingerprint(weights) if _asks_prior(self.config) else None
+        self.weights_mark: str | None = None
         self.sink = sink
         self.stop = stop
         self.stage = ""
         self.seconds: dict[str, float] = {}
+        self.time_left = TimeLeft({})
 
     def run(self) -> Result:
         given = None if self.job.cameras is None else read_cameras(self.job.cameras)
         with open_clip(self.job.video, frame_rate=self.config.frames.frame_rate) as clip:
             source = clip.fingerprint
+            self._inspect(clip, given)
             frames_mark = self._frames(clip)
             smoke_mark = self._smoke(frames_mark, has_alpha=clip.has_alpha)
             cameras_mark = self._cameras(smoke_mark, given, size=(clip.width, clip.height))
@@ -110,6 +115,42 @@ class Pipeline:
         result = self._export(source, cameras_mark, visual_mark, forecast_mark)
         write_text(self.folder.timing, json.dumps(self.seconds, indent=2))
         return result
+
+    def _inspect(self, clip: Clip, given: Cameras | None) -> None:
+        """Decide what the clip requires, and go on with settings that say so."""
+        start, stop = frames.frame_range(clip, self.job.frame_start, self.job.frame_stop)
+        cameras, chosen = given.to_json() if given else None, sorted(self.job.overrides)
+        by_user = [key for key in inspect.KEYS if key in chosen]
+        inputs = (clip.fingerprint, str(start), str(stop), cameras, *by_user, *self._given_images())
+        mark = fingerprint("inspect", inspect.settings_of(self.config), *inputs)
+
+        def write(report: StageReport) -> None:
+            decisions, seen = inspect.run(clip, self.config, report, chosen=chosen, start=start, stop=stop, given=given)
+            for entry in decisions.warnings:
+                report.warning(entry.code, entry.message)
+            expected = estimate(seen, decisions.followed(self.config), preset=self.job.preset, chosen=chosen)
+            write_text(self.folder.estimate, replace(expected, fingerprint=mark).to_json())
+            write_text(self.folder.decisions, replace(decisions, fingerprint=mark).to_json())
+
+        self._stage("inspect", mark, _json_entry(self.folder.decisions, "fingerprint"), write)
+        decisions = read_decisions(self.folder.path)
+        self.config = decisions.followed(self.config)
+        self.stages = stages_of(self.config)
+        self.weights_mark = weights_fingerprint(self.weights) if _asks_prior(self.config) else None
+        expected = self._expected(mark)
+        ahead = self.stages[1:]
+        self.time_left = TimeLeft({name: expected.stages.get(name, 0.0) for name in ahead} if expected is not None else {})
+        self.sink.send(events.Artifact(kind="decisions", path=DECISIONS_FILE))
+        if expected is not None:
+            self.sink.send(events.Artifact(kind="estimate", path=ESTIMATE_FILE))
+
+    def _expected(self, mark: str) -> Estimate | None:
+        """What this job was estimated to take; None where no such file can be read: then the pace alone tells."""
+        try:
+            found = read_estimate(self.folder.estimate.read_text(encoding="utf-8"))
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return None
+        return found if found.fingerprint == mark else None
 
     def _frames(self, clip: Clip) -> str:
         config = self.config.frames
@@ -131,8 +172,7 @@ class Pipeline:
 
     def _smoke(self, frames_mark: str, *, has_alpha: bool) -> str:
         config = self.config.extraction
-        given = [file_fingerprint(p) if p else None for p in (config.clean_plate, config.garbage_matte, config.smoke_mask)]
-        mark = fingerprint("smoke", config, frames_mark, str(has_alpha), *given)
+        mark = fingerprint("smoke", config, frames_mark, str(has_alpha), *self._given_images())
 
         def write(report: StageReport) -> None:
             with open_stage_file(self.folder.frames) as source:
@@ -189,10 +229,7 @@ class Pipeline:
             with open_stage_file(self.folder.smoke) as file:
                 layers, cameras = FrameStack(file, "smoke"), read_cameras(self.folder.cameras)
                 parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
-                # Where the camera hardly goes around the smoke nothing is seen of its depth: the silhouette's solid is the
-                # better answer, and torch need not be loaded.
-                if turned_about(make_scene(layers, cameras)) >= LEAST_TURN:
-                    _keep(parts, self._proposed(layers, cameras, report, parts))
+                _keep(parts, self._proposed(layers, cameras, report, parts))
             write_records(self.folder.volume, mark, parts)
             parts.remove()
 
@@ -383,6 +420,12 @@ class Pipeline:
 
     # -- bookkeeping ----------------------------------------------------------------------------------------------
 
+    def _given_images(self) -> list[str | None]:
+        """The content of the images that the artist gave for the extraction."""
+        config = self.config.extraction
+        paths = (config.clean_plate, config.garbage_matte, config.smoke_mask)
+        return [file_fingerprint(path) if path else None for path in paths]
+
     def _method_marks(self) -> tuple[str, ...]:
         """What the particles follow from besides; nothing for the default, whose files stay valid."""
         if self.config.method == "default":
@@ -394,14 +437,16 @@ class Pipeline:
         self.stop.check()
         self.stage = name
         is_done = found == mark
-        self.sink.send(events.Stage(name=name, index=self.stages.index(name), count=len(self.stages), skipped=is_done))
+        left = self.time_left.begin(name, time.monotonic(), is_skipped=is_done)
+        index, count = self.stages.index(name), len(self.stages)
+        self.sink.send(events.Stage(name=name, index=index, count=count, skipped=is_done, job_seconds_left=left))
         kept = _json_entry(self._warnings_path, name)
         if is_done:
             for entry in kept or []:
                 self.sink.send(events.Warning(**entry))
             return
         self.folder.result.unlink(missing_ok=True)
-        report = StageReport(name, self.sink, self.stop)
+        report = StageReport(name, self.sink, self.stop, time_left=self.time_left)
         began = time.monotonic()
         with storage_errors(self.folder.path):
             write(report)

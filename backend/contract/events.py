@@ -33,24 +33,30 @@ class Hello:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
-    """A stage begins (`skipped`: its file was there already, nothing is computed). index counts from 0."""
+    """A stage begins (`skipped`: its file was there already, nothing is computed). index counts from 0.
+
+    job_seconds_left: of the whole job, None while unknown.
+    """
 
     event: ClassVar[str] = "stage"
     name: str
     index: int
     count: int
     skipped: bool = False
+    job_seconds_left: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """Step `step` of `total` of a stage is done; seconds_left is of the stage, None while unknown."""
+    """Step `step` of `total` of a stage is done; seconds_left is of the stage, job_seconds_left of the whole job, None while
+    unknown."""
 
     event: ClassVar[str] = "progress"
     stage: str
     step: int
     total: int
     seconds_left: float | None = None
+    job_seconds_left: float | None = None
     metrics: dict[str, float] = field(default_factory=dict)
 
 

@@ -23,6 +23,7 @@ METHODS = ("default", "as_published", "fluidnexus")
 DEVICES = ("auto", "cpu", "cuda")
 EXTRACTION_MODES = ("auto", "on_black", "alpha", "matte")
 CAMERA_MODES = ("auto", "still", "given")
+COLOR_MODES = ("auto", "full", "one_hue")
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:
@@ -144,15 +145,18 @@ class VisualConfig:
 
     num_particles: at most, in any frame. iterations: optimiser steps a frame. mass_iterations: multiplicative
     updates of the optical masses a frame. consistency: pull towards the optical masses carried from the
-    previous frame, 0 to 1.
+    previous frame, 0 to 1. color: "full" fits three channels, "one_hue" only how bright the clip's one hue is;
+    "auto" looks at the clip which will do.
     """
 
     num_particles: int = 6000
     iterations: int = 6
     mass_iterations: int = 8
     consistency: float = 0.1
+    color: str = "auto"
 
     def __post_init__(self) -> None:
+        _check_choice("color", self.color, COLOR_MODES)
         _check("num_particles", self.num_particles, 8, 10_000_000)
         _check("iterations", self.iterations, 0, 10_000)
         _check("mass_iterations", self.mass_iterations, 1, 1000)
@@ -226,10 +230,12 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """Every setting. seed: of all random numbers. method: how physical and visual particles are fitted and forecast."""
+    """Every setting. seed: of all random numbers. method: how physical and visual particles are fitted and forecast.
+    follow_clip: let the clip decide what it requires (contract/decisions.py); off, every setting stands as it is."""
 
     seed: int = 0
     method: str = "default"
+    follow_clip: bool = True
     frames: FramesConfig = field(default_factory=FramesConfig)
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)

@@ -13,6 +13,7 @@ import numpy as np
 
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain
+from backend.fit.colors import hue_of
 from backend.fit.depths import Depths
 from backend.fit.follow import drawn_level, drawn_near, points_on_rays
 from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
@@ -46,6 +47,7 @@ class Appearance:
         self.seed = seed
         masses = [frame_mass(scene, layers[frame], frame) for frame in range(len(layers))]
         fullest = int(np.argmax(masses))
+        self.hue = hue_of(layers[frame] for frame in range(len(layers))) if config.color == "one_hue" else None
         self.unit_mass = max(masses[fullest], 1e-30) / config.num_particles
         self.scale = SCALE_SHARE * self._spacing(fullest)
 
@@ -86,7 +88,7 @@ class Appearance:
         record = self._weighed(record, frame, target, consistency=0.0)
         if config.iterations == 0:
             return record, 0.0
-        return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale)
+        return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale, hue=self.hue)
 
     def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, prior: depth_prior.DepthPrior) -> VisualRecord:
         """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows,

@@ -45,21 +45,23 @@ def refine(
     *,
     iterations: int,
     reference_scale: float,  # m, the scale of a particle at birth
+    hue: np.ndarray | None = None,  # [3] linear: all smoke is of this colour, only brighter or darker; None: of any colour
 ) -> tuple[VisualRecord, float]:
     """The refined record and the loss before the last step."""
     if len(record.positions) == 0:
         return record, float(np.square(layer, dtype=np.float64).mean())
-    target = np.ascontiguousarray(np.moveaxis(layer, -1, 0), np.float32)
+    channels = None if hue is None else _along(hue)
+    target = _seen_through(layer, channels)
     carried = record.positions
     scales = record.scales.astype(np.float64)
     log_masses = np.log(np.maximum(record.optical_masses.astype(np.float64), 1e-30))
-    colors = record.colors.astype(np.float64)
+    colors = record.colors.astype(np.float64) if channels is None else record.colors.astype(np.float64) @ channels.T
     positions = carried.copy()
     adam = {
         "positions": Adam.like(positions, POSITION_STEP * reference_scale),
         "scales": Adam.like(scales, LOG_SCALE_STEP),
         "masses": Adam.like(log_masses, LOG_STEP),
-        "colors": Adam.like(colors, COLOR_STEP),
+        "colors": Adam.like(colors, COLOR_STEP * (3.0 / colors.shape[1]) ** 0.5),  # as far as three equal channels go
     }
     loss = 0.0
     for _ in range(iterations):
@@ -68,11 +70,10 @@ def refine(
             positions=positions,
             scales=scales.astype(np.float32),
             optical_masses=np.exp(log_masses).astype(np.float32),
-            colors=colors.astype(np.float32),
         )
-        splat = renderer.forward(as_gaussians(current), view, features=current.colors)
-        shown, opacity = composite(splat.image)  # [3, H, W], [H, W]
-        color_error, opacity_error = shown - target[:3], opacity - target[3]
+        splat = renderer.forward(as_gaussians(current), view, features=colors.astype(np.float32))
+        shown, opacity = composite(splat.image)  # [channels, H, W], [H, W]
+        color_error, opacity_error = shown - target[:-1], opacity - target[-1]
         loss = float(np.square(color_error, dtype=np.float64).mean() + np.square(opacity_error, dtype=np.float64).mean())
         gradients = renderer.backward(splat, composite_backward(splat.image, color_error, opacity_error))
         pull = (positions - carried) / reference_scale
@@ -92,6 +93,19 @@ def refine(
         positions=positions,
         scales=scales.astype(np.float32),
         optical_masses=np.exp(log_masses).astype(np.float32),
-        colors=colors.astype(np.float32),
+        colors=(colors if channels is None else colors @ channels).astype(np.float32),
     )
     return refined, loss
+
+
+def _along(hue: np.ndarray) -> np.ndarray:
+    """[1, 3]: the direction of a colour, on which colours are measured."""
+    return (np.asarray(hue, np.float64) / max(float(np.linalg.norm(hue)), 1e-12))[None]
+
+
+def _seen_through(layer: np.ndarray, channels: np.ndarray | None) -> np.ndarray:
+    """[H, W, 4] -> [channels + 1, H, W] float32: what the fit has to show, the opacity last."""
+    if channels is None:
+        return np.ascontiguousarray(np.moveaxis(layer, -1, 0), np.float32)
+    light = np.moveaxis(layer[..., :3] @ channels.T.astype(np.float32), -1, 0)
+    return np.concatenate([light, layer[None, ..., 3]]).astype(np.float32)

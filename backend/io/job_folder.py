@@ -10,7 +10,9 @@ from typing import Any
 
 from backend import __version__
 from backend.contract import result
+from backend.contract.decisions import DECISIONS_FILE
 from backend.contract.errors import BackendError
+from backend.contract.estimates import ESTIMATE_FILE
 from backend.contract.job import Job
 from backend.contract.units import STAGE_FORMAT_VERSION
 from backend.io.atomic import storage_errors, write_text
@@ -36,6 +38,8 @@ class JobFolder:
         self.forecast = self.stages / "forecast.h5"
         self.plate = path / "background.png"
         self.timing = path / "timing.json"
+        self.decisions = path / DECISIONS_FILE
+        self.estimate = path / ESTIMATE_FILE
 
     def create(self) -> None:
         """Make the folder and see that it can be written to. Raises BackendError."""

@@ -1,153 +1,219 @@
-"""What a clip needs, and why: every decision with the quantity that was measured for it. Nothing is fitted."""
+"""Clip -> decisions: which parts run and at what size, each with its reason and the measured quantity behind it.
+
+Each decision gives settings values that the user left to the clip. Nothing is fitted. What each one saves and costs is in
+docs/decisions.md; thresholds were chosen on the tuning scenes named there.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, replace
+from typing import Any
 
-import numpy as np
-
-from backend.contract.job import Config, FramesConfig
-from backend.fit import stabilise
-from backend.fit.extraction import SmokeLayer, extract
+from backend.contract.cameras import Cameras
+from backend.contract.decisions import Decision, Decisions, Warned
+from backend.contract.job import Config, FramesConfig, override
+from backend.fit.scene import LEAST_TURN
+from backend.fit.survey import Survey, decibels, survey
 from backend.io.video import Clip
-from backend.io.working_frames import has_premultiplied_alpha, reduced, working_size
-from backend.reporting import SilentReport
+from backend.reporting import Report
 
-_MAX_FRAMES = 48  # looked at, spread over the part that is decoded
-_MAX_DECODED = 900  # frames; the end of a longer clip is not looked at
-_MAX_SIDE = 320  # px
-_SMOKE_OPACITY = 0.05
-_DENSE_OPACITY, _DENSE_SHARE = 0.8, 0.2  # dense: this share of the smoke's pixels is more opaque than this
-_COLORED = 0.15  # (largest - smallest channel) / largest, of the mean smoke colour
-_EVOLVING = 0.2  # share of the opacity that is elsewhere, or gone, between the clip's first and last third
-_PIXELS_A_PARTICLE = 2.0  # finer than this, the picture cannot tell visual particles apart
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
-    """One choice: its name, the value chosen, why in one sentence, and the measured quantities behind it."""
-
-    name: str
-    value: str | int
-    reason: str
-    measured: dict[str, float] = field(default_factory=dict)
+LEAST_ONE_HUE_DB = 64.0  # of pictures brought to one hue: 16 dB beyond what the finest fit reaches costs it 0.1 dB
+LEAST_DETAIL_DB = 58.0  # of pictures reduced and brought back
+PARTICLES_A_PIXEL = 6.0  # of the frame with most smoke; up to here more particles show more
+FEWEST_PARTICLES = 64
+KEYS = (  # with which the user decides instead
+    "extraction.mode",
+    "cameras.mode",
+    "frames.working_size",
+    "volume.use_prior",
+    "visual.color",
+    "visual.num_particles",
+)
 
 
-def inspect(clip: Clip, config: Config) -> list[Decision]:
-    """The decisions for a clip, from at most 48 of its frames at 320 px. Raises BackendError, as a run would."""
-    frames = _sampled(clip, config.frames)
-    report = SilentReport()
-    layer = extract(frames, config.extraction, report, has_alpha=clip.has_alpha)
-    layers = list(layer.frames)
-    opacities = np.stack([image[..., 3] for image in layers])
-    return [
-        Decision(name="extraction", value=layer.mode, reason=layer.reason, measured=layer.measured),
-        _camera(frames, layers, config),
-        _density(opacities),
-        _color(layers, layer),
-        _change(opacities),
-        _resolution(clip, config),
-        _particles(clip, config, opacities),
-    ]
+def run(
+    clip: Clip,
+    config: Config,
+    report: Report,
+    *,
+    chosen: Collection[str] = (),  # keys of the settings that the user set
+    start: int = 0,
+    stop: int | None = None,
+    given: Cameras | None = None,
+) -> tuple[Decisions, Survey]:
+    """The decisions for frames start to stop - 1, and what was measured. Raises BackendError, as a run would."""
+    seen = survey(clip, config, report, start=start, stop=clip.num_frames if stop is None else stop, given=given)
+    return decide(seen, config, chosen=chosen), seen
 
 
-def to_text(decisions: Sequence[Decision]) -> str:
-    """For people: one decision a paragraph."""
-    width = max(len(decision.name) for decision in decisions)
-    lines = []
-    for decision in decisions:
-        lines.append(f"{decision.name:<{width}}  {decision.value}: {decision.reason}")
-        if decision.measured:
-            figures = ", ".join(f"{name} {value:.4g}" for name, value in decision.measured.items())
-            lines.append(f"{'':<{width}}  ({figures})")
-    return "\n".join(lines)
+def settings_of(config: Config) -> dict[str, Any]:
+    """The settings that decisions follow from: with others changed they stay."""
+    sections = {"frames", "extraction", "cameras", "volume", "visual"}
+    return {name: value for name, value in asdict(config).items() if name in sections | {"method", "follow_clip"}}
 
 
-def to_json(decisions: Sequence[Decision]) -> str:
-    """For programs: {"decisions": [{"name", "value", "reason", "measured"}]}."""
-    return json.dumps({"decisions": [dataclasses.asdict(d) for d in decisions]}, indent=2, allow_nan=False)
+def decide(seen: Survey, config: Config, *, chosen: Collection[str] = ()) -> Decisions:
+    """What follows from a survey. With follow_clip off, or set by the user, a setting stands as it is."""
+    makers: list[Callable[[Survey, Config], Decision]] = [_extraction, _camera, _resolution]
+    if config.method == "default":
+        makers += [_depth, _color, _particles]
+    made: list[Decision] = []
+    followed = config
+    for make in makers:
+        made.append(_overruled(make(seen, followed), config, chosen))
+        followed = override(followed, made[-1].sets)  # how many particles show depends on the resolution
+    return Decisions(decisions=tuple(made), warnings=_warnings(made))
 
 
-def _sampled(clip: Clip, config: FramesConfig) -> list[np.ndarray]:
-    """At most 48 frames [h, w, 4] linear, evenly spread."""
-    small = dataclasses.replace(config, working_size=min(config.working_size, _MAX_SIDE))
-    size = working_size(clip, small)
-    num = min(clip.num_frames, _MAX_DECODED)
-    wanted = set(np.unique(np.linspace(0, num - 1, min(num, _MAX_FRAMES)).round().astype(int)).tolist())
-    is_premultiplied = clip.has_alpha and has_premultiplied_alpha(clip.frames(0, num))
-    return [
-        reduced(image, size, is_premultiplied=is_premultiplied)
-        for index, image in enumerate(clip.frames(0, max(wanted) + 1))
-        if index in wanted
-    ]
+def _overruled(decision: Decision, config: Config, chosen: Collection[str]) -> Decision:
+    """The decision, or the user's own where there is one."""
+    by_user = [key for key in decision.keys if key in chosen and _value(config, key) != "auto"]
+    if by_user:
+        reason = f"You set {by_user[0]}. {decision.reason}"
+    elif not config.follow_clip:
+        reason = f"follow_clip is off, so the settings stand. {decision.reason}"
+    else:
+        return decision
+    stands = _value(config, decision.keys[0])
+    value = decision.value if stands == "auto" else _word(decision.name, stands)
+    return replace(decision, value=value, reason=reason, sets={}, is_overridden=True)
 
 
-def _camera(frames: list[np.ndarray], layers: list[np.ndarray], config: Config) -> Decision:
-    name = "camera"
-    if config.cameras.mode != "auto":
-        return Decision(name=name, value=config.cameras.mode, reason="The settings say so.")
-    motion = stabilise.measure_motion(frames, range(len(frames)), background=lambda k: stabilise.is_background(layers[k]))
-    measured = {"tracks": float(motion.num_tracks), "displacement": motion.displacement, "parallax": motion.parallax}
-    if not motion.is_known:
-        reason = "The background shows nothing that could be tracked, so nothing says that the camera moves."
-        return Decision(name=name, value="still", reason=reason, measured=measured)
-    if motion.is_still:
-        reason = f"The background shifts by {motion.displacement:.2%} of the picture."
-        return Decision(name=name, value="still", reason=reason, measured=measured)
-    reason = f"The background shifts by {motion.displacement:.0%} of the picture; give cameras.json, else it is taken as still."
-    return Decision(name=name, value="moving", reason=reason, measured=measured)
+def _word(name: str, value: object) -> str | int:
+    """A setting's value as its decision would call it."""
+    if isinstance(value, bool):
+        return "prior" if value else "silhouette"
+    if name == "resolution":
+        return f"at most {value} px"
+    return value if isinstance(value, (str, int)) else str(value)
 
 
-def _density(opacities: np.ndarray) -> Decision:
-    """opacities [n, h, w]."""
-    smoke = opacities[opacities > _SMOKE_OPACITY]
-    share = float(np.mean(smoke > _DENSE_OPACITY)) if smoke.size else 0.0
-    is_dense = share > _DENSE_SHARE
-    reason = f"{share:.0%} of the smoke's pixels are more than {_DENSE_OPACITY:.0%} opaque."
-    measured = {"opaque_share": share, "median_opacity": float(np.median(smoke)) if smoke.size else 0.0}
-    return Decision(name="density", value="dense" if is_dense else "light", reason=reason, measured=measured)
+def _value(config: Config, key: str) -> object:
+    section, _, name = key.rpartition(".")
+    return getattr(getattr(config, section) if section else config, name)
 
 
-def _color(layers: list[np.ndarray], layer: SmokeLayer) -> Decision:
-    light = np.sum([image[..., :3].sum(axis=(0, 1), dtype=np.float64) for image in layers], axis=0)
-    mass = sum(float(image[..., 3].sum(dtype=np.float64)) for image in layers)
-    color = light / max(mass, 1e-9)
-    chroma = float((color.max() - color.min()) / max(color.max(), 1e-6))
-    is_colored = chroma > _COLORED
-    reason = f"The channels of the mean smoke colour differ by {chroma:.0%}."
-    measured = {"chroma": chroma, "red": float(color[0]), "green": float(color[1]), "blue": float(color[2])}
-    return Decision(name="color", value="coloured" if is_colored else "grey", reason=reason, measured=measured)
+def _extraction(seen: Survey, config: Config) -> Decision:
+    return Decision(
+        name="extraction",
+        value=seen.mode,
+        reason=seen.mode_reason,
+        measured=seen.measured,
+        sets={"extraction.mode": seen.mode},
+        keys=("extraction.mode",),
+    )
 
 
-def _change(opacities: np.ndarray) -> Decision:
-    """Whether the smoke as a whole stays as it is: mean opacity of the first third against that of the last."""
-    third = max(1, len(opacities) // 3)
-    first, last = opacities[:third].mean(axis=0), opacities[-third:].mean(axis=0)
-    distance = float(np.abs(last - first).sum() / max(first.sum() + last.sum(), 1e-6))
-    growth = float(last.sum() / max(first.sum(), 1e-6))
-    value = "evolving" if distance > _EVOLVING else "quasi-steady"
-    reason = f"Between its first and its last third, {distance:.0%} of the clip's smoke is in another place, new or gone."
-    return Decision(name="change", value=value, reason=reason, measured={"distance": distance, "growth": growth})
+def _camera(seen: Survey, config: Config) -> Decision:
+    motion, measured = seen.motion, {}
+    if seen.has_cameras:
+        value, measured = "given", {"turn_degrees": math.degrees(seen.turn)}
+        reason = f"cameras.json says where it is; it goes {math.degrees(seen.turn):.0f} degrees around the smoke."
+    elif motion is None:
+        value, reason = "still", "The clip shows no background against which a camera could be seen to move."
+    else:
+        measured = {"tracks": float(motion.num_tracks), "displacement": motion.displacement, "parallax": motion.parallax}
+        value = "still"
+        if not motion.is_known:
+            reason = "The background shows nothing that could be tracked, so nothing says that the camera moves."
+        elif motion.is_still:
+            reason = f"The background shifts by {motion.displacement:.2%} of the picture."
+        else:
+            value = "moving"
+            reason = f"The background shifts by {motion.displacement:.0%} of the picture; it needs a cameras.json."
+    mode = "given" if value == "given" else "still"
+    return Decision(
+        name="camera", value=value, reason=reason, measured=measured, sets={"cameras.mode": mode}, keys=("cameras.mode",)
+    )
 
 
-def _resolution(clip: Clip, config: Config) -> Decision:
-    width, height = working_size(clip, config.frames)
-    is_reduced = (width, height) != (clip.width, clip.height)
-    reason = f"The clip is {clip.width} x {clip.height}; the longest side is held to {config.frames.working_size} px."
-    if not is_reduced:
-        reason = f"The clip is {clip.width} x {clip.height}, no larger than frames.working_size; it is fitted as it is."
-    measured = {"width": float(width), "height": float(height)}
-    return Decision(name="resolution", value=f"{width} x {height}", reason=reason, measured=measured)
+def _resolution(seen: Survey, config: Config) -> Decision:
+    """The smallest size that still shows what the smoke shows, at most the settings'."""
+    longest, wanted = max(seen.source_size), config.frames.working_size
+    looked_at, size = max(seen.size), min(wanted, longest)
+    enough = [share for share, error in seen.detail_errors.items() if decibels(error) >= LEAST_DETAIL_DB]
+    detail = round(min(enough) * looked_at) if enough else None
+    measured = {f"kept_at_{round(share * looked_at)}_px_db": decibels(error) for share, error in seen.detail_errors.items()}
+    if detail is not None and detail < size:
+        size = max(detail, 16)
+        reason = f"The smoke has no detail that {size} px do not show ({LEAST_DETAIL_DB:.0f} dB and more)."
+    elif size < longest:
+        reason = f"The longest side is held to {wanted} px; the smoke has detail enough for them."
+    else:
+        reason = f"The clip has no more than {longest} px."
+    width, height = _scaled(seen.source_size, size)
+    return Decision(
+        name="resolution",
+        value=f"{width} x {height}",
+        reason=reason,
+        measured=measured,
+        sets={} if size >= min(wanted, longest) else {"frames.working_size": size},
+        keys=("frames.working_size",),
+    )
 
 
-def _particles(clip: Clip, config: Config, opacities: np.ndarray) -> Decision:
-    """The settings' number of visual particles, or fewer where the smoke covers fewer pixels than they could show."""
-    width, height = working_size(clip, config.frames)
-    covered = float((opacities > _SMOKE_OPACITY).mean()) * width * height
-    useful = max(64, round(covered / _PIXELS_A_PARTICLE))
-    value = min(config.visual.num_particles, useful)
-    reason = f"The smoke covers {covered:.0f} pixels a frame; the settings allow {config.visual.num_particles}."
-    return Decision(name="visual particles", value=value, reason=reason, measured={"smoke_pixels": covered})
+def _depth(seen: Survey, config: Config) -> Decision:
+    degrees, least = math.degrees(seen.turn), math.degrees(LEAST_TURN)
+    asks = seen.turn >= LEAST_TURN
+    shown = f"from {least:.0f} on, the prior sees depth and motion" if asks else f"less than {least:.0f} show no depth"
+    reason = f"The camera goes {degrees:.1f} degrees around the smoke; {shown}."
+    return Decision(
+        name="depth",
+        value="prior" if asks else "silhouette",
+        reason=reason,
+        measured={"turn_degrees": degrees},
+        sets={"volume.use_prior": asks},
+        keys=("volume.use_prior",),
+    )
+
+
+def _color(seen: Survey, config: Config) -> Decision:
+    kept = decibels(seen.one_hue_error)
+    is_one = kept >= LEAST_ONE_HUE_DB
+    way = "is more than any fit reaches" if is_one else f"is less than the {LEAST_ONE_HUE_DB:.0f} dB that would do"
+    reason = f"The clip with one hue for all smoke is the same to {kept:.1f} dB, which {way}."
+    value = "one_hue" if is_one else "full"
+    return Decision(
+        name="color",
+        value=value,
+        reason=reason,
+        measured={"one_hue_db": kept},
+        sets={"visual.color": value},
+        keys=("visual.color",),
+    )
+
+
+def _particles(seen: Survey, config: Config) -> Decision:
+    """As many visual particles as the settings allow, or fewer where the smoke covers too few pixels to show them."""
+    width, height = _scaled(seen.source_size, min(config.frames.working_size, max(seen.source_size)))
+    covered = seen.fullest_share * width * height
+    useful, allowed = max(FEWEST_PARTICLES, round(PARTICLES_A_PIXEL * covered)), config.visual.num_particles
+    value = min(allowed, useful)
+    reason = f"The smoke covers at most {covered:.0f} pixels, which show {useful} particles; the settings allow {allowed}."
+    return Decision(
+        name="particles",
+        value=value,
+        reason=reason,
+        measured={"smoke_pixels": covered},
+        sets={"visual.num_particles": value} if value < allowed else {},
+        keys=("visual.num_particles",),
+    )
+
+
+def _scaled(size: tuple[int, int], longest: int) -> tuple[int, int]:
+    config = FramesConfig(working_size=max(16, longest))
+    share = min(1.0, config.working_size / max(size))
+    return max(8, round(size[0] * share)), max(8, round(size[1] * share))
+
+
+def _warnings(decisions: Sequence[Decision]) -> tuple[Warned, ...]:
+    camera = next(decision for decision in decisions if decision.name == "camera")
+    if camera.value != "moving":
+        return ()
+    message = (
+        f"The camera moves (the background shifts by {camera.measured['displacement']:.0%} of the picture); for now it is "
+        "treated as if it stood still. Give the solved camera with --cameras cameras.json."
+    )
+    return (Warned(code="camera_moves", message=message),)

@@ -16,7 +16,7 @@ import numpy as np
 from backend.io.vdb import openvdb_module
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-NOT_COMPARED = {"timing.json", "log.txt", "job.json", "running.json"}
+NOT_COMPARED = {"timing.json", "estimate.json", "log.txt", "job.json", "running.json"}
 SMALL = {
     "frames.working_size": "64",
     "physical.num_particles": "150",

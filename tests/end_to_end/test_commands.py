@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -14,7 +15,9 @@ import pytest
 from small_job import assert_whole, backend, backend_command, digest, environment, settings
 
 from backend.contract import events
-from backend.contract.job import read_job
+from backend.contract.decisions import read_decisions
+from backend.contract.estimates import read_estimate, read_outlook
+from backend.contract.job import PRESETS, read_job
 from backend.contract.result import read_result
 from backend.contract.running import process_start
 from backend.io.particles import read_particles
@@ -53,7 +56,9 @@ def test_a_finished_job_is_not_done_again(job: Path, plume: Path) -> None:
     done = backend("reconstruct", plume, "--job", job, *settings())
     assert done.returncode == 0
     stages = [event for event in map(events.decode, done.stdout.splitlines()) if isinstance(event, events.Stage)]
-    assert [stage.name for stage in stages] == list(stages_of(read_job(job / "job.json").config()))
+    config = read_job(job / "job.json").config()
+    assert [stage.name for stage in stages] == list(stages_of(read_decisions(job).followed(config)))
+    assert "volume" not in stages_of(read_decisions(job).followed(config)), "this camera stands still"
     assert all(stage.skipped for stage in stages)
     assert digest(job) == before
 
@@ -114,6 +119,27 @@ def test_inspect_gives_its_reasons(plume: Path) -> None:
     assert any(decision["value"] == "on_black" for decision in decisions)
     assert all(decision["reason"] for decision in decisions)
     assert "on_black" in backend("inspect", plume).stdout
+    outlook = read_outlook(done.stdout)
+    assert [item.preset for item in outlook.estimates] == list(PRESETS)
+    assert all(item.seconds > 0.0 and item.memory_gib > 0.0 for item in outlook.estimates)
+
+
+def test_a_job_keeps_what_was_decided_and_estimated_and_says_what_is_left(job: Path) -> None:
+    decisions = read_decisions(job)
+    assert decisions["extraction"].value == "on_black" and decisions["depth"].value == "silhouette"
+    assert decisions["resolution"].is_overridden, "the small job sets frames.working_size"
+    with read_particles(job / "particles.h5") as particles:
+        assert particles.info.provenance["settings"]["extraction"]["mode"] == "on_black"
+    expected = read_estimate((job / "estimate.json").read_text(encoding="utf-8"))
+    assert expected.fingerprint == decisions.fingerprint and expected.quality == (), "its settings were never measured"
+    shutil.rmtree(job / "vdb")
+    (job / "result.json").unlink()
+    heard = [events.decode(line) for line in backend("run", "--job", job).stdout.splitlines()]
+    steps = [event for event in heard if isinstance(event, events.Progress)]
+    assert steps and all(step.stage == "export" and step.job_seconds_left is not None for step in steps)
+    assert all(step.seconds_left is not None for step in steps) and steps[-1].job_seconds_left == 0.0
+    kinds = [event.kind for event in heard if isinstance(event, events.Artifact)]
+    assert kinds[:2] == ["decisions", "estimate"]
 
 
 def test_the_report_is_drawn(job: Path, tmp_path: Path) -> None:

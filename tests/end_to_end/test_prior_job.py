@@ -16,13 +16,13 @@ from wildsmoke.addon.status import STAGE_LABELS
 
 from backend.contract import events
 from backend.contract.cameras import read_cameras
+from backend.contract.decisions import read_decisions
 from backend.contract.errors import BackendError, Cancelled
 from backend.contract.job import Config, Job, override
 from backend.events_out import StopRequest
-from backend.fit.state import VolumeRecord
 from backend.io.job_folder import JobFolder, fingerprint
 from backend.io.particles import read_particles
-from backend.io.records import RecordFile, read_stamp
+from backend.io.records import read_stamp
 from backend.pipeline import STAGES, run_job, stages_of
 from backend.prior.network import PlumeNet
 from backend.prior.predict import save_weights
@@ -89,6 +89,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(clip: Path, folder: Path, weights: Path, *, stop: StopRequest | None = None, **changes: object) -> Heard:
     heard = Heard()
     asked = {"volume.use_prior": True, **{key.replace("__", "."): value for key, value in changes.items()}}
+    asked = {key: value for key, value in asked.items() if value is not None}
     folder.mkdir(exist_ok=True)
     JobFolder(folder).write_job(Job(video=str(clip), cameras=str(clip.parent / "cameras.json"), overrides={**SMALL, **asked}))
     run_job(folder, heard, stop or StopRequest(), weights=weights)
@@ -100,7 +101,7 @@ def job(clip: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("job")
     heard = run(clip, folder, weights)
     told = [event for event in heard.events if isinstance(event, events.Stage)]
-    assert [(stage.name, stage.index, stage.count) for stage in told] == [(name, n, 8) for n, name in enumerate(STAGES)]
+    assert [(stage.name, stage.index, stage.count) for stage in told] == [(name, n, 9) for n, name in enumerate(STAGES)]
     ends = [event for event in heard.events if isinstance(event, events.Progress) and event.stage == "volume"]
     assert (ends[-1].step, ends[-1].total) == (NUM_FRAMES, NUM_FRAMES)
     return folder
@@ -165,8 +166,8 @@ def test_other_weights_make_what_follows_from_them_stale(job: Path, clip: Path, 
     marks = {name: read_stamp(folder / "stages" / f"{name}.h5") for name in ("volume", "physical", "visual")}
     again = written(tmp_path / "weights.npz", seed=3)
     heard = run(clip, folder, again)
-    assert heard.stages(skipped=True) == ["frames", "smoke", "cameras"]
-    assert heard.stages(skipped=False) == list(STAGES[3:])
+    assert heard.stages(skipped=True) == ["inspect", "frames", "smoke", "cameras"]
+    assert heard.stages(skipped=False) == list(STAGES[4:])
     for name, mark in marks.items():
         assert read_stamp(folder / "stages" / f"{name}.h5") not in (None, mark, read_stamp(job / "stages" / f"{name}.h5"))
 
@@ -177,22 +178,22 @@ def test_a_camera_that_stands_still_is_not_asked_for_depth(clip: Path, weights: 
     (clip.parent / "still").mkdir()
     (clip.parent / "still" / "cameras.json").write_text(still.to_json(), encoding="utf-8")
     (clip.parent / "still" / "plume").symlink_to(clip)
-    run(clip.parent / "still" / "plume", tmp_path / "job", weights)
-    with RecordFile(tmp_path / "job/stages/volume.h5", VolumeRecord) as volumes:
-        assert len(volumes) == 0
+    heard = run(clip.parent / "still" / "plume", tmp_path / "job", tmp_path / "nowhere.npz", volume__use_prior=None)
+    assert heard.stages(skipped=False) == list(WITHOUT), "nor are its weights"
+    assert read_decisions(tmp_path / "job")["depth"].value == "silhouette"
 
 
 def test_without_the_prior_nothing_changes(plain: Path, clip: Path, tmp_path: Path) -> None:
     """The fingerprints are those of versions that had no prior, and neither its settings nor its weights have a say."""
-    config = override(Config(), SMALL)
+    config = read_decisions(plain).followed(override(Config(), SMALL))
     assert not (plain / "stages" / "volume.h5").exists()
     smoke, cameras = read_stamp(plain / "stages/smoke.h5"), json.loads((plain / "cameras.json").read_text())["fingerprint"]
     physical = fingerprint("physical", config.physical, "0", smoke, cameras)
     assert read_stamp(plain / "stages/physical.h5") == physical
     assert read_stamp(plain / "stages/visual.h5") == fingerprint("visual", config.visual, "0", smoke, cameras, physical)
     heard = run(clip, plain, tmp_path / "nowhere.npz", volume__use_prior=False, volume__stride=5)
-    assert heard.stages(skipped=True) == list(WITHOUT[:-1]), "another job.json ends the old result.json, nothing more"
-    assert {stage.count for stage in heard.events if isinstance(stage, events.Stage)} == {7}
+    assert heard.stages(skipped=True) == list(WITHOUT[1:-1]), "another stride is looked at again, and ends the old result.json"
+    assert {stage.count for stage in heard.events if isinstance(stage, events.Stage)} == {8}
 
 
 @pytest.mark.parametrize("method", ["as_published", "fluidnexus"])

@@ -15,12 +15,12 @@ from test_prior_job import Heard, written
 from tiny_bench import NUM_FRAMES, NUM_SEEN, VIEWS, draw_scene
 
 from backend.contract.errors import BackendError
-from backend.contract.job import Job
+from backend.contract.job import Config, Job, override
 from backend.contract.result import read_result
 from backend.events_out import StopRequest
 from backend.geometry.camera import view_at
 from backend.io.job_folder import JobFolder
-from backend.pipeline import run_job
+from backend.pipeline import run_job, stages_of
 from backend.score.finished_job import score_job
 from backend.score.truth_set import read_truth_set
 from benchmarks import reconstruction, reconstruction_figures, tilted_scene
@@ -64,7 +64,7 @@ def test_every_cell_is_there_with_what_it_cost_and_scored(made: Path) -> None:
     for cell in found["cells"]:
         assert (cell["scene"], cell["preset"], cell["untouched"], cell["weights"]) == ("wind_wisp", "draft", True, None)
         cost = cell["cost"]
-        assert set(cost["stages"]) == {"start", "frames", "smoke", "cameras", "physical", "visual", "forecast", "export"}
+        assert set(cost["stages"]) == {"start", *stages_of(override(Config(), {"volume.use_prior": False}))}
         assert 0.5 * cost["seconds"] < sum(cost["stages"].values()) < cost["seconds"] + 0.1
         assert cost["cpu_seconds"] > 0.5 and 0.1 < cost["peak_gib"] < 3.0 and not cost["is_resumed"]
         scores = cell["scores"]
