@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pytest
+if TYPE_CHECKING:
+    import pytest  # not at run time: the checks inside Blender's wheel read this file, too, and have no pytest
 
 CHECKOUT = Path(__file__).resolve().parent
 

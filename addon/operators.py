@@ -81,6 +81,34 @@ def _import(operator: bpy.types.Operator, scene: bpy.types.Scene, folder: Path) 
     return {"FINISHED"}
 
 
+class WILDSMOKE_OT_inspect_clip(bpy.types.Operator):
+    """Look at the clip: what it requires, and what each preset will take in minutes and memory. Nothing is fitted"""
+
+    bl_idname = "wildsmoke.inspect_clip"
+    bl_label = "Estimate"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return session.current.clip_look is None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        current = session.current
+        try:
+            session.start_look(make_job(context.scene.wildsmoke, device=session.default_device()))
+        except BackendError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if not bpy.app.background:
+            session.start_ticking()
+            return {"FINISHED"}
+        current.look, current.clip_look = current.clip_look.wait(), None
+        if current.look.outlook is None:
+            self.report({"ERROR"}, current.look.problem)
+            return {"CANCELLED"}
+        print(current.look.outlook.to_text())
+        return {"FINISHED"}
+
+
 class WILDSMOKE_OT_cancel(bpy.types.Operator):
     """Stop the running job. What it has computed is kept, and Start resumes it"""
 
@@ -195,6 +223,7 @@ class WILDSMOKE_OT_open_preferences(bpy.types.Operator):
 
 CLASSES = (
     WILDSMOKE_OT_start,
+    WILDSMOKE_OT_inspect_clip,
     WILDSMOKE_OT_cancel,
     WILDSMOKE_OT_import_result,
     WILDSMOKE_OT_check_backend,

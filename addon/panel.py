@@ -1,9 +1,14 @@
 """The panel in the 3D viewport's sidebar."""
 
+from dataclasses import replace
+
 import bpy
 
+from ..backend.contract.decisions import Decisions
+from ..backend.contract.errors import BackendError
+from ..backend.contract.job import Job
 from . import session
-from .settings import changed_settings, fields_of, job_folder
+from .settings import changed_settings, fields_of, job_folder, make_job
 from .status import JobStatus, Phase, headline, progress_text
 from .text import characters_across, draw_paragraph
 
@@ -106,6 +111,56 @@ def draw_status(layout: bpy.types.UILayout, status: JobStatus, *, width: int) ->
         draw_paragraph(box, warning, width=width, icon="INFO")
 
 
+class WILDSMOKE_PT_outlook(_SidebarPanel, bpy.types.Panel):
+    bl_idname = "WILDSMOKE_PT_outlook"
+    bl_parent_id = "WILDSMOKE_PT_main"
+    bl_label = "What to Expect"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        settings, current = context.scene.wildsmoke, session.current
+        layout, width = self.layout, characters_across(context)
+        is_looking = current.clip_look is not None
+        row = layout.row()
+        row.enabled = not is_looking
+        row.operator("wildsmoke.inspect_clip", text="Looking at the clip..." if is_looking else "Estimate", icon="TIME")
+        look = current.look
+        if look is not None and look.problem:
+            draw_paragraph(layout, look.problem, width=width, icon="ERROR")
+        decisions = current.supervisor.decisions(job_folder(settings))
+        if look is not None and look.outlook is not None:
+            box = layout.box().column(align=True)
+            if not _is_of(look.job, settings):
+                draw_paragraph(box, "Clip or settings have changed since.", width=width, icon="INFO")
+            for item in look.outlook.estimates:
+                icon = "RADIOBUT_ON" if item.preset == settings.preset else "RADIOBUT_OFF"
+                text = item.to_text()
+                draw_paragraph(box, text[:1].upper() + text[1:], width=width, icon=icon)
+            decisions = look.outlook.decisions
+        if decisions is not None:
+            draw_decisions(layout, decisions, width=width)
+
+
+def _is_of(job: Job, settings: bpy.types.PropertyGroup) -> bool:
+    """Whether a look is still true. The preset may be another: all of them were looked at."""
+    try:
+        wanted = make_job(settings, device=job.device)
+    except BackendError:
+        return False
+    return replace(wanted, preset=job.preset, device=job.device) == job
+
+
+def draw_decisions(layout: bpy.types.UILayout, decisions: Decisions, *, width: int) -> None:
+    """What the clip requires, one decision a paragraph. width: characters in a line."""
+    box = layout.box().column(align=True)
+    box.label(text="What the clip requires", icon="VIEWZOOM")
+    for decision in decisions.decisions:
+        name = decision.name.replace("_", " ").capitalize()
+        icon = "MODIFIER" if decision.is_overridden else "DOT"
+        draw_paragraph(box, f"{name}: {decision.value}. {decision.reason}", width=width, icon=icon)
+    for warning in decisions.warnings:
+        draw_paragraph(box, warning.message, width=width, icon="ERROR")
+
+
 class WILDSMOKE_PT_settings(_SidebarPanel, bpy.types.Panel):
     bl_idname = "WILDSMOKE_PT_settings"
     bl_parent_id = "WILDSMOKE_PT_main"
@@ -123,6 +178,7 @@ class WILDSMOKE_PT_settings(_SidebarPanel, bpy.types.Panel):
             row = layout.row()
             row.label(text=f"{len(changed)} changed from {settings.preset.capitalize()}", icon="MODIFIER")
             row.operator("wildsmoke.reset_settings", text="", icon="LOOP_BACK")
+        layout.prop(settings.config, "follow_clip")
         layout.prop(settings.config, "method")
         layout.prop(settings.config, "seed")
 
@@ -170,6 +226,7 @@ class WILDSMOKE_PT_log(_SidebarPanel, bpy.types.Panel):
 
 CLASSES = (
     WILDSMOKE_PT_main,
+    WILDSMOKE_PT_outlook,
     WILDSMOKE_PT_settings,
     *(_section_panel(section, label) for section, label in SECTIONS),
     WILDSMOKE_PT_log,

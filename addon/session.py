@@ -15,7 +15,9 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..backend.contract.errors import BackendError
+from ..backend.contract.job import Job
 from .backend_check import BackendCheck, Finding, find_python, python_for_set_up, set_up_commands
+from .clip_look import ClipLook, Look
 from .job_runner import Backend
 from .supervisor import Supervisor
 
@@ -32,13 +34,17 @@ class Session:
         self.supervisor = Supervisor()
         self.check: BackendCheck | None = None
         self.finding: Finding | None = None
+        self.clip_look: ClipLook | None = None
+        self.look: Look | None = None
 
     def close(self) -> None:
         """End everything that runs."""
         self.supervisor.close()
         if self.check is not None:
             self.check.close()
-        self.check = self.finding = None
+        if self.clip_look is not None:
+            self.clip_look.close()
+        self.check = self.finding = self.clip_look = self.look = None
 
 
 current = Session()
@@ -91,6 +97,14 @@ def start_check() -> None:
         current.finding = Finding(is_usable=False, lines=((False, error.message),), commands=commands)
 
 
+def start_look(job: Job) -> None:
+    """Begin to look at a clip. Raises BackendError where there is no backend."""
+    if current.clip_look is not None:
+        current.clip_look.close()
+    current.look = current.clip_look = None
+    current.clip_look = ClipLook(backend(), job)
+
+
 def look(folder: Path | None) -> None:
     """See what a job folder holds, and follow it if somebody works there."""
     if folder is not None:
@@ -113,12 +127,16 @@ def tick() -> float | None:
     if current.check is not None and (finding := current.check.poll()) is not None:
         current.finding, current.check = finding, None
         has_news = True
+    if current.clip_look is not None and (seen := current.clip_look.poll()) is not None:
+        current.look, current.clip_look = seen, None
+        has_news = True
     for folder in current.supervisor.take_finished():
         # apart, so that a defect in the import cannot stop this timer
         bpy.app.timers.register(lambda folder=folder: import_finished(folder), first_interval=0.0)
     if has_news:
         redraw()
-    return TICK_SECONDS if current.supervisor.needs_ticks or current.check is not None else None
+    is_asking = current.check is not None or current.clip_look is not None
+    return TICK_SECONDS if current.supervisor.needs_ticks or is_asking else None
 
 
 def redraw() -> None:

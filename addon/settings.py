@@ -179,6 +179,16 @@ class WILDSMOKE_PG_visual(bpy.types.PropertyGroup):
         min=0.0,
         max=1.0,
     )
+    color: EnumProperty(
+        name="Color",
+        description="Which colours are fitted",
+        items=(
+            ("auto", "Automatic", "Look at the clip which will do"),
+            ("full", "Full", "Three channels for each particle"),
+            ("one_hue", "One Hue", "The clip's one hue, brighter or darker; takes two thirds of the time"),
+        ),
+        default="auto",
+    )
 
 
 class WILDSMOKE_PG_forecast(bpy.types.PropertyGroup):
@@ -260,6 +270,11 @@ class WILDSMOKE_PG_config(bpy.types.PropertyGroup):
             ("fluidnexus", "FluidNexus", "The same without learned buoyancy and frequency loss"),
         ),
         default="default",
+    )
+    follow_clip: BoolProperty(
+        name="Follow the Clip",
+        description="Let the clip decide what it requires, where a setting was left alone; off, every setting stands as it is",
+        default=True,
     )
     frames: PointerProperty(type=WILDSMOKE_PG_frames)
     extraction: PointerProperty(type=WILDSMOKE_PG_extraction)

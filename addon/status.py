@@ -11,6 +11,7 @@ from .job_runner import NOISE_PREFIX, RunState
 from .job_state import JobKind, JobState
 
 STAGE_LABELS = {
+    "inspect": "Looking at the clip",
     "frames": "Reading the clip",
     "smoke": "Finding the smoke",
     "cameras": "Placing the camera",
@@ -45,7 +46,7 @@ class Phase(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobStatus:
-    """fraction: of the whole job, 0 to 1; seconds_left: of the stage, None while unknown."""
+    """fraction: of the whole job, 0 to 1; seconds_left: of the stage, job_seconds_left: of all of it, None while unknown."""
 
     phase: Phase = Phase.NONE
     device: str = ""
@@ -54,6 +55,7 @@ class JobStatus:
     stage_count: int = 0
     fraction: float = 0.0
     seconds_left: float | None = None
+    job_seconds_left: float | None = None
     code: str = ""
     message: str = ""
     hint: str = ""
@@ -76,6 +78,7 @@ def after(status: JobStatus, event: events.Event) -> JobStatus:
                 stage_count=count,
                 fraction=_share(done, count),
                 seconds_left=None,
+                job_seconds_left=_seconds(event.job_seconds_left),
             )
         case events.Progress():
             count = max(status.stage_count, 1)
@@ -85,15 +88,18 @@ def after(status: JobStatus, event: events.Event) -> JobStatus:
                 stage=event.stage,
                 fraction=min((_share(status.stage_index, count)) + within * _share(1, count), 1.0),
                 seconds_left=_seconds(event.seconds_left),
+                job_seconds_left=_seconds(event.job_seconds_left),
             )
         case events.Warning():
             if event.message in status.warnings:
                 return status
             return replace(status, warnings=(*status.warnings, event.message))
         case events.Done():
-            return replace(status, fraction=1.0, seconds_left=None)
+            return replace(status, fraction=1.0, seconds_left=None, job_seconds_left=None)
         case events.Error():
-            return replace(status, code=event.code, message=event.message, hint=event.hint, seconds_left=None)
+            return replace(
+                status, code=event.code, message=event.message, hint=event.hint, seconds_left=None, job_seconds_left=None
+            )
         case _:
             return status
 
@@ -121,7 +127,7 @@ def ended(status: JobStatus, state: RunState, *, log_tail: list[str], log: str, 
         case RunState.FAILED:
             return replace(status, phase=Phase.FAILED)
         case RunState.CANCELLED:
-            return replace(status, phase=Phase.CANCELLED, message="", hint=RESUMING, seconds_left=None)
+            return replace(status, phase=Phase.CANCELLED, message="", hint=RESUMING, seconds_left=None, job_seconds_left=None)
         case _:
             words = [line for line in log_tail if not line.startswith(NOISE_PREFIX)]
             reason = f" Its last words: {words[-1]}" if words else ""
@@ -131,6 +137,7 @@ def ended(status: JobStatus, state: RunState, *, log_tail: list[str], log: str, 
                 message=f"The backend ended without a word (exit code {exit_code}).{reason}",
                 hint=f"{RESUMING} The whole log: {log}",
                 seconds_left=None,
+                job_seconds_left=None,
             )
 
 
@@ -178,8 +185,10 @@ def headline(status: JobStatus) -> str:
 
 
 def progress_text(status: JobStatus) -> str:
-    """For the bar: per cent, and the time that the stage still takes."""
+    """For the bar: per cent, and the time that the job still takes, or at least the stage."""
     text = f"{math.floor(status.fraction * 100)} %"
+    if status.job_seconds_left is not None:
+        return f"{text}, {duration(status.job_seconds_left)} left"
     return text if status.seconds_left is None else f"{text}, {duration(status.seconds_left)} left in this stage"
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..backend.contract import events, result
+from ..backend.contract.decisions import Decisions, read_decisions
 from ..backend.contract.errors import BackendError
 from ..backend.contract.job import Job
 from .job_runner import Backend, JobRunner
@@ -30,6 +31,7 @@ class Supervisor:
         self.runner: JobRunner | None = None
         self._statuses: dict[Path, JobStatus] = {}
         self._logs: dict[Path, list[str]] = {}
+        self._decisions: dict[Path, Decisions] = {}
         self._finished: list[Path] = []
         self._next_log = 0.0
         self._next_look = 0.0
@@ -50,6 +52,16 @@ class Supervisor:
     def log_lines(self, folder: Path | None) -> list[str]:
         return self._logs.get(folder, []) if folder else []
 
+    def decisions(self, folder: Path | None) -> Decisions | None:
+        """What a job follows; None where it has none yet."""
+        return self._decisions.get(folder) if folder else None
+
+    def _read_decisions(self, folder: Path) -> None:
+        try:
+            self._decisions[folder] = read_decisions(folder)
+        except BackendError:
+            self._decisions.pop(folder, None)  # none yet, or damaged: the job then makes them anew
+
     def shown(self) -> tuple[dict[Path, JobStatus], dict[Path, list[str]]]:
         """All that a panel may show, to compare with what it was."""
         return dict(self._statuses), dict(self._logs)
@@ -59,6 +71,7 @@ class Supervisor:
         if folder != self.running_folder:
             self._statuses[folder] = found(JobState.find(folder))
             self._logs[folder] = read_tail(folder / result.LOG_FILE, max_lines=LOG_LINES)
+            self._read_decisions(folder)
         return self._statuses[folder]
 
     def start(self, backend: Backend, folder: Path, job: Job) -> None:
@@ -93,6 +106,8 @@ class Supervisor:
         status = self._statuses[folder]
         for event in taken:
             status = after(status, event)
+            if isinstance(event, events.Artifact) and event.kind == "decisions":
+                self._read_decisions(folder)
         now = time.monotonic()
         if runner.state.is_final or now >= self._next_log:
             self._next_log = now + LOG_SECONDS
@@ -142,6 +157,7 @@ class Supervisor:
             self.runner = None
         self._statuses.clear()
         self._logs.clear()
+        self._decisions.clear()
         self._finished.clear()
 
 

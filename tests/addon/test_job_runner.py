@@ -41,7 +41,15 @@ def wait_dead(pid: int, seconds: float) -> float:
 def test_a_success_gives_its_events_in_order(runner, run_to_end):
     start(runner, "succeed")
     received = run_to_end(runner)
-    assert [type(event).event for event in received] == ["hello", "stage", "stage", *["progress"] * 3, "warning", "done"]
+    assert [type(event).event for event in received] == [
+        "hello",
+        "artifact",
+        "stage",
+        "stage",
+        *["progress"] * 3,
+        "warning",
+        "done",
+    ]
     assert runner.state is RunState.DONE and runner.exit_code == 0
     assert runner.poll() == []
     assert "a line for the log" in runner.log.read_text()

@@ -22,6 +22,7 @@ anything = st.one_of(
         step=st.integers() | st.just(10**400),
         total=st.integers() | st.just(10**401),
         seconds_left=st.none() | st.floats(allow_nan=False, allow_infinity=False) | st.just(10**400),
+        job_seconds_left=st.none() | st.floats(allow_nan=False, allow_infinity=False) | st.just(10**400),
     ),
     st.builds(events.Warning, code=st.text(), message=st.text()),
     st.builds(events.Artifact, kind=st.text(), path=st.text()),
@@ -41,6 +42,14 @@ def test_progress_by_hand():
     status = after(status, events.Stage(name="visual", index=4, count=7, skipped=True))
     assert math.isclose(status.fraction, 5 / 7) and progress_text(status) == "71 %"
     assert after(status, events.Done(result="result.json", seconds=3.0)).fraction == 1.0
+
+
+def test_the_time_of_the_whole_job_is_told_where_it_is_known():
+    status = after(STARTING, events.Stage(name="physical", index=3, count=6, job_seconds_left=200.0))
+    assert progress_text(status) == "50 %, 3 min 20 s left"
+    status = after(status, events.Progress(stage="physical", step=1, total=2, seconds_left=20.0, job_seconds_left=95.0))
+    assert progress_text(status) == "58 %, 1 min 35 s left"
+    assert progress_text(after(status, events.Done(result="result.json", seconds=3.0))) == "100 %"
 
 
 def test_an_unknown_stage_is_shown_by_its_name():
@@ -64,6 +73,7 @@ def test_no_numbers_break_it(received):
         status = after(status, event)
         assert 0.0 <= status.fraction <= 1.0
         assert status.seconds_left is None or 0.0 <= status.seconds_left < 1e8
+        assert status.job_seconds_left is None or 0.0 <= status.job_seconds_left < 1e8
         assert headline(status) and progress_text(status)
 
 

@@ -208,6 +208,7 @@ def _compare(group: Any, values: Any, names: set[str]) -> None:
                 "Config": contract.METHODS,
                 "ExtractionConfig": contract.EXTRACTION_MODES,
                 "CamerasConfig": contract.CAMERA_MODES,
+                "VisualConfig": contract.COLOR_MODES,
             }
             assert tuple(prop.enum_items.keys()) == choices[type(values).__name__], where
         else:
@@ -330,6 +331,51 @@ def check_the_backend_is_checked(folder: Path) -> None:
         assert "[wildsmoke.copy_commands]" in layout.drawn
 
 
+def check_what_to_expect_is_told_before_start(folder: Path) -> None:
+    with registered() as session:
+        settings = set_job(folder, "error")
+        assert "too short" in message_of(bpy.ops.wildsmoke.inspect_clip)
+        assert "too short" in " ".join(draw("WILDSMOKE_PT_outlook"))
+        settings.video = str(folder / "succeed.mp4")
+        assert bpy.ops.wildsmoke.inspect_clip() == {"FINISHED"}
+        drawn = " ".join(draw("WILDSMOKE_PT_outlook"))
+        assert "Draft: 1.3 to 3 min, 0.5 GiB" in drawn and "Depth: silhouette" in drawn and "changed since" not in drawn
+        settings.preset = "final"
+        assert "changed since" not in " ".join(draw("WILDSMOKE_PT_outlook")), "all presets were looked at"
+        settings.config.visual.iterations = 99
+        assert "changed since" in " ".join(draw("WILDSMOKE_PT_outlook"))
+        settings.video = ""
+        assert "changed since" in " ".join(draw("WILDSMOKE_PT_outlook"))
+        assert "no clip" in message_of(bpy.ops.wildsmoke.inspect_clip)
+        session.current.look = None
+        settings.config.visual.iterations, settings.preset = 16, "preview"
+
+
+def check_the_look_is_followed_by_the_timer(folder: Path) -> None:
+    with registered() as session:
+        from wildsmoke.addon.settings import make_job
+
+        settings = set_job(folder, "succeed")
+        session.start_look(make_job(settings, device="auto"))
+        assert "[Looking at the clip...]" in draw("WILDSMOKE_PT_outlook")
+        tick_until(session, lambda: session.current.look is not None)
+        assert session.current.clip_look is None and session.current.look.outlook is not None
+        set_job(folder, "hang")
+        session.start_look(make_job(settings, device="auto"))
+        process = session.current.clip_look._process
+    assert process.poll() is not None, "unregister ends it"
+
+
+def check_a_job_shows_what_it_follows(folder: Path) -> None:
+    with registered() as session, fake_import():
+        set_job(folder, "succeed")
+        bpy.ops.wildsmoke.start()
+        assert "Depth: silhouette" in " ".join(draw("WILDSMOKE_PT_outlook"))
+        session.current.supervisor.close()
+        session.look(folder / "job")
+        assert "Depth: silhouette" in " ".join(draw("WILDSMOKE_PT_outlook"))
+
+
 def check_a_run_is_followed_by_the_timer(folder: Path) -> None:
     with registered() as session:
         settings = set_job(folder, "slow")
@@ -342,7 +388,7 @@ def check_a_run_is_followed_by_the_timer(folder: Path) -> None:
         tick_until(session, lambda: status().seconds_left is not None)
         drawn = draw("WILDSMOKE_PT_main")
         assert "Fitting the look (2 of 2)" in drawn and "[wildsmoke.cancel]" in drawn
-        assert any("left in this stage" in text for text in drawn)
+        assert any(text.endswith(" left") for text in drawn)
         assert not bpy.ops.wildsmoke.start.poll()
         settings.output_folder = str(folder / "elsewhere")
         assert any("A job is running in" in text for text in draw("WILDSMOKE_PT_main"))
@@ -432,7 +478,7 @@ def check_every_panel_draws_in_every_phase(folder: Path) -> None:
 
         set_job(folder, "succeed")
         panels = [name for name in dir(bpy.types) if name.startswith("WILDSMOKE_PT_")]
-        assert len(panels) == 3 + len({key.partition(".")[0] for key in contract.settable_keys(contract.Config()) if "." in key})
+        assert len(panels) == 4 + len({key.partition(".")[0] for key in contract.settable_keys(contract.Config()) if "." in key})
         for phase in Phase:
             status = JobStatus(phase=phase, stage="visual", stage_count=3, message="What is wrong.", hint="What to do.")
             session.current.supervisor._statuses[folder / "job"] = status

@@ -30,6 +30,32 @@ RESULT = {
 }
 
 
+DECISIONS = {
+    "format_version": 1,
+    "decisions": [
+        {
+            "name": "depth",
+            "value": "silhouette",
+            "reason": "The camera stands still.",
+            "measured": {"turn_degrees": 0.0},
+            "sets": {"volume.use_prior": False},
+            "keys": ["volume.use_prior"],
+            "is_overridden": False,
+        }
+    ],
+    "warnings": [{"code": "camera_moves", "message": "The camera moves."}],
+    "fingerprint": "abc",
+}
+ESTIMATE = {
+    "format_version": 1,
+    "seconds": 120.0,
+    "stages": {"frames": 20.0, "visual": 100.0},
+    "memory_gib": 0.5,
+    "compile_seconds": 0.0,
+    "quality": [{"view": "input", "mean_db": 32.0, "spread_db": 2.0, "num_scenes": 5}],
+    "fingerprint": "abc",
+}
+
 _SENDING = threading.Lock()  # two threads send; print() would write a line and its end apart
 
 
@@ -62,7 +88,8 @@ def steps(count: int, seconds: float) -> None:
     for step in range(count):
         time.sleep(seconds)
         left = (count - step - 1) * seconds
-        send("progress", stage="visual", step=step + 1, total=count, seconds_left=left, metrics={"loss": 0.5})
+        times = {"seconds_left": left, "job_seconds_left": left + 1.0}
+        send("progress", stage="visual", step=step + 1, total=count, **times, metrics={"loss": 0.5})
 
 
 def finish(folder: Path) -> None:
@@ -70,7 +97,24 @@ def finish(folder: Path) -> None:
     send("done", result="result.json", seconds=1.0)
 
 
+def inspect(behaviour: str) -> None:
+    """What `inspect --json` prints."""
+    if behaviour == "hang":
+        time.sleep(600)
+    if behaviour == "error":
+        print("The clip is too short. Trim less of it.", file=sys.stderr)
+        sys.exit(2)
+    if behaviour == "noise":
+        print('{"decisions": [], "estimates": 3}')
+        return
+    estimates = [{"preset": preset, **ESTIMATE} for preset in ("draft", "preview", "final")]
+    print(json.dumps({**DECISIONS, "estimates": estimates}))
+
+
 def main() -> None:
+    if sys.argv[1] == "inspect":
+        inspect(Path(sys.argv[2]).stem)
+        return
     folder = Path(sys.argv[sys.argv.index("--job") + 1])
     job = json.loads((folder / "job.json").read_text())
     behaviour = Path(job["video"]).stem
@@ -86,6 +130,8 @@ def main() -> None:
     send("hello", protocol=1, version="0.1.0", device="cpu")
     print("a line for the log", file=sys.stderr, flush=True)
     if behaviour == "succeed":
+        (folder / "decisions.json").write_text(json.dumps(DECISIONS))
+        send("artifact", kind="decisions", path="decisions.json")
         steps(3, 0.02)
         send("warning", code="camera_still", message="The camera is taken as still.")
         finish(folder)
