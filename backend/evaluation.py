@@ -20,6 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--input", default=INPUT_VIEW, metavar="NAME", help="of a set of cameras: the one that was fitted")
     parser.add_argument("--out", type=Path, metavar="JSON")
+    parser.add_argument("--html", type=Path, metavar="HTML", help="a report with curves and pictures, in one file")
     parser.add_argument("--lpips", type=Path, nargs="+", metavar="FILE", help="weights of LPIPS or ST-LPIPS, kept by torch.save")
 
 
@@ -30,6 +31,7 @@ def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
     """
     from backend.io.atomic import write_text
     from backend.score.finished_job import open_job, scores_of
+    from backend.score.page.report import write_report
     from backend.score.perceptual import read_perceptual
     from backend.score.read_truth import read_truth
     from backend.score.text_table import table
@@ -43,6 +45,8 @@ def evaluate(options: argparse.Namespace, sink: EventSink, stop: StopRequest) ->
     perceptual = read_perceptual(options.lpips) if options.lpips else None
     with open_job(JobFolder(options.job), truth) as job:
         scores = scores_of(job, truth, perceptual=perceptual, begin=begin)
+        if options.html is not None:
+            write_report(options.html, scores, job, truth, report=begin("report"))
     sink.close()
     print(table(scores))
     if options.out is not None:

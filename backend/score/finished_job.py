@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -86,7 +87,7 @@ def score_job(
 
 
 def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, begin: Reports) -> dict[str, Any]:
-    """not_measured: what is left out, and why."""
+    """job: how it was made. not_measured: what is left out, and why."""
     scores = evaluate(job.prediction, truth, anchor=job.anchor, prior=job.proposals, perceptual=perceptual, begin=begin)
     scores["divergence"] = mean_divergence(job.particles, report=begin("divergence"))
     scores["buoyancy"] = learned_buoyancy(job.particles)
@@ -99,7 +100,20 @@ def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, 
         missing["velocity"] = "the truth holds no velocities"
     if not any(name.startswith("future_") for name in scores):
         missing["future"] = "the job holds no forecast of frames that the truth shows"
-    return scores | {"not_measured": missing}
+    return scores | {"job": job_facts(job), "not_measured": missing}
+
+
+def job_facts(job: FinishedJob) -> dict[str, Any]:
+    """Program, preset, method, and the seconds of its stages as far as the job knows them."""
+    provenance = job.particles.info.provenance
+    settings = provenance.get("settings", {})
+    facts = {"program": provenance.get("program"), "preset": provenance.get("preset"), "method": settings.get("method")}
+    try:
+        seconds = json.loads(job.folder.timing.read_text(encoding="utf-8"))
+        facts["seconds"] = {str(stage): float(value) for stage, value in seconds.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        facts["seconds"] = {}  # a note for people, not part of the result
+    return facts
 
 
 def check_world(cameras: Cameras, truth: Truth, anchor: np.ndarray) -> None:
