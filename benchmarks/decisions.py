@@ -1,0 +1,247 @@
+"""What each decision of `inspect` is worth: the five scenes as decided, and with one decision at a time made the other way.
+
+    python -m benchmarks.decisions --out DIR [--scenes a,b] [--frames A:B] [--preset draft] [--json FILE] [--page]
+
+A cell is a scene and a variant; what is there is not made again. Figures are of a few frames of each view, processor seconds
+of all stages (those that a variant shares with the scene as decided cost what they cost there). DIR/results.json gathers all
+cells, `--json` writes it elsewhere, `--page` into docs/results and makes docs/decisions.md. Thresholds were chosen on the
+scenes that are not marked as untouched.
+"""
+
+from __future__ import annotations
+
+from backend import kernel_setup  # noqa: F401 before numba loads
+
+# isort: split
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from backend.contract.decisions import read_decisions
+from backend.contract.job import Job
+from backend.contract.result import CAMERAS_FILE
+from backend.contract.truth import INPUT_FOLDER, SMOKE_VIDEO, TRUTH_FILE, TRUTH_FOLDER
+from backend.events_out import StopRequest
+from backend.io.atomic import write_text
+from backend.io.job_folder import JobFolder
+from backend.pipeline import run_job
+from benchmarks.cost import CHECKOUT
+from benchmarks.reconstruction import SETS, UNTOUCHED, code_digest, machine, run_module
+from benchmarks.trade_cell import Meter
+
+RESULTS = CHECKOUT / "docs" / "results" / "decisions.json"
+FRAMES = (40, 85)  # there is smoke in every scene, and the camera goes twenty degrees around it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """decision: that it is about; question: what is asked; changes: settings; on: those of the job that it is compared with.
+
+    is_made: `inspect` makes this decision; else it was tried and found not to be worth making.
+    """
+
+    name: str
+    decision: str
+    question: str
+    changes: dict[str, str]
+    on: dict[str, str] = field(default_factory=dict)
+    is_made: bool = True
+
+    @property
+    def base(self) -> str:
+        return "decided" if not self.on else "decided, " + ", ".join(f"{key}={value}" for key, value in self.on.items())
+
+
+SMALL = {"frames.working_size": "80", "visual.num_particles": "4000"}
+VARIANTS = (
+    Variant(name="matte", decision="extraction", question="smoke on black is matted", changes={"extraction.mode": "matte"}),
+    Variant(name="still", decision="camera", question="a moving camera is left out", changes={"cameras.mode": "still"}),
+    Variant(name="silhouette", decision="depth", question="the prior is left out", changes={"volume.use_prior": "false"}),
+    Variant(name="half size", decision="resolution", question="half the size", changes={"frames.working_size": "128"}),
+    Variant(name="one hue", decision="color", question="one channel for three", changes={"visual.color": "one_hue"}),
+    Variant(name="half of them", decision="particles", question="half as many", changes={"visual.num_particles": "2000"}),
+    Variant(
+        name="few pixels",
+        decision="particles",
+        question="6 a pixel where the settings ask for many more",
+        changes={"visual.num_particles": "1500"},
+        on=SMALL,
+    ),
+    Variant(
+        name="fewer mass updates",
+        decision="density",
+        question="half the updates of the optical masses",
+        changes={"visual.mass_iterations": "3"},
+        is_made=False,
+    ),
+    Variant(
+        name="more consistency",
+        decision="change",
+        question="three times the pull to the masses of the frame before",
+        changes={"visual.consistency": "0.3"},
+        is_made=False,
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One job. name: of its variant, or of what variants are compared with."""
+
+    root: Path
+    scene: Path
+    name: str
+    preset: str
+    frames: tuple[int, int]
+    changes: dict[str, str]
+    base: str | None
+
+    @property
+    def record(self) -> Path:
+        return self.root / self.scene.name / f"{self.name.replace(' ', '_').replace('=', '_')}.json"
+
+    @property
+    def job(self) -> Path:
+        return self.record.with_suffix("")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--from", dest="source", type=Path, default=SETS)
+    parser.add_argument("--scenes", type=lambda text: text.split(","), help="all without it")
+    parser.add_argument("--frames", type=lambda text: tuple(map(int, text.split(":"))), default=FRAMES, metavar="A:B")
+    parser.add_argument("--preset", default="draft")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--page", action="store_true", help="also docs/decisions.md")
+    parser.add_argument("--cell", help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    if given.cell:
+        run_cell(json.loads(given.cell))
+        return 0
+    if given.out is None:
+        parser.error("--out is missing")
+    root, failures = given.out.resolve(), 0
+    scenes = given.scenes or sorted(path.parents[1].name for path in given.source.glob(f"*/{TRUTH_FOLDER}/{TRUTH_FILE}"))
+    for scene in scenes:
+        folder = (given.source / scene).resolve()
+        for cell in cells_of(root, folder, preset=given.preset, frames=given.frames):
+            failures += not complete(cell)
+    results = gather(root, scenes, preset=given.preset, frames=given.frames)
+    text = as_text(results)
+    write_text(root / "results.json", text)
+    for path in (given.json, RESULTS if given.page else None):
+        if path is not None:
+            write_text(path, text)
+    if given.page:
+        run_module("tools.decisions_page")
+    return 1 if failures else 0
+
+
+def cells_of(root: Path, scene: Path, *, preset: str, frames: tuple[int, int]) -> Iterator[Cell]:
+    """Of a scene, each after the one that it is compared with."""
+    common: dict[str, Any] = {"root": root, "scene": scene, "preset": preset, "frames": frames}
+    told: set[str] = set()
+    for variant in VARIANTS:
+        if variant.base not in told:
+            told.add(variant.base)
+            yield Cell(**common, name=variant.base, changes=dict(variant.on), base=None)
+        yield Cell(**common, name=variant.name, changes=variant.on | variant.changes, base=variant.base)
+
+
+def complete(cell: Cell) -> bool:
+    """Make what is missing of a cell; whether it is there then."""
+    if cell.record.exists():
+        return True
+    base = None if cell.base is None else Cell(**{**_fields(cell), "name": cell.base, "base": None})
+    shutil.rmtree(cell.job, ignore_errors=True)
+    cell.job.parent.mkdir(parents=True, exist_ok=True)
+    if base is not None and base.job.is_dir():
+        shutil.copytree(base.job, cell.job)
+    order = {
+        **{name: str(value) if isinstance(value, Path) else value for name, value in _fields(cell).items()},
+        "donor": str(base.record) if base is not None else None,
+        "began": time.monotonic(),
+    }
+    command = [sys.executable, "-m", "benchmarks.decisions", "--cell", json.dumps(order)]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=CHECKOUT, env=environment, check=False)
+    if cell.base is not None:
+        shutil.rmtree(cell.job, ignore_errors=True)
+    if done.returncode != 0:
+        words = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
+        print(f"{cell.scene.name} {cell.name}: {words}", file=sys.stderr, flush=True)
+        return False
+    print(cell.record.read_text(encoding="utf-8"), flush=True)
+    return True
+
+
+def _fields(cell: Cell) -> dict[str, Any]:
+    return {name: getattr(cell, name) for name in Cell.__dataclass_fields__}
+
+
+def run_cell(order: dict[str, Any]) -> None:
+    """In a process of its own: the job, then its scores, then the record."""
+    paths = {name: Path(order[name]) for name in ("root", "scene")}
+    cell = Cell(**{name: order[name] for name in Cell.__dataclass_fields__} | paths)
+    first, stop = cell.frames
+    folder = JobFolder(cell.job)
+    job = Job(
+        video=str(cell.scene / INPUT_FOLDER / SMOKE_VIDEO),
+        preset=cell.preset,
+        cameras=str(cell.scene / INPUT_FOLDER / CAMERAS_FILE),
+        frame_start=first,
+        frame_stop=stop,
+        overrides=dict(cell.changes),
+    )
+    folder.create()
+    folder.write_job(job)
+    donor = json.loads(Path(order["donor"]).read_text(encoding="utf-8")) if order["donor"] else {}
+    meter = Meter(order["began"])
+    run_job(folder.path, meter, StopRequest())
+    stages = meter.stages(donor)
+
+    from benchmarks.trade_score import score_window  # after the measurement: it is no part of the job
+
+    scores = score_window(folder, cell.scene, cell.root / "pictures", scored=(first, stop))
+    decided = {item.name: {"value": item.value, "measured": item.measured} for item in read_decisions(folder.path).decisions}
+    record = {
+        "scene": cell.scene.name,
+        "untouched": cell.scene.name in UNTOUCHED,
+        "name": cell.name,
+        "base": cell.base,
+        "changes": cell.changes,
+        "decisions": decided,
+        "cpu_seconds": round(sum(stage["cpu_seconds"] for stage in stages.values()), 2),
+        "stages": {name: stage["cpu_seconds"] for name, stage in stages.items()},
+        "scores": scores,
+        "code": code_digest(),
+    }
+    write_text(cell.record, json.dumps(record, allow_nan=False))
+
+
+def gather(root: Path, scenes: list[str], *, preset: str, frames: tuple[int, int]) -> dict[str, Any]:
+    """All cells that are there, and what the variants are."""
+    cells = [json.loads(path.read_text(encoding="utf-8")) for scene in scenes for path in sorted((root / scene).glob("*.json"))]
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", len(os.sched_getaffinity(0))))
+    variants = [{**asdict(variant), "base": variant.base} for variant in VARIANTS]
+    return {"machine": machine(), "threads": threads, "preset": preset, "frames": frames, "variants": variants, "cells": cells}
+
+
+def as_text(results: dict[str, Any]) -> str:
+    """JSON with a line for each cell."""
+    head = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in results.items() if name != "cells")
+    rows = ",\n".join(json.dumps(cell, allow_nan=False) for cell in results["cells"])
+    return f'{{\n{head},\n"cells": [\n{rows}\n]\n}}\n'
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
