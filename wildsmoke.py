@@ -4,6 +4,7 @@
     python3 wildsmoke.py test [pytest args]   lint, types, all tests
     python3 wildsmoke.py package              dist/wildsmoke-<version>.zip for Blender
     python3 wildsmoke.py synth [...]          the synthetic benchmark
+    python3 wildsmoke.py bench [...]          speed, memory and accuracy against every setting
     python3 wildsmoke.py <command ...>        the backend's commands: reconstruct, render, export, ...
 
 Standard library only. The backend's environment and Blender's wheel are apart, as on an artist's machine.
@@ -82,6 +83,9 @@ def main(arguments: list[str]) -> int:
         if command == "synth":
             set_up(BACKEND, BLENDER)
             return run([BACKEND.interpreter, "-m", "synthetic", *rest], cwd=None)
+        if command == "bench":
+            set_up(BACKEND, BLENDER)
+            return run([BACKEND.interpreter, "-m", "benchmarks.trade", *rest], cwd=None)
         set_up(BACKEND, BLENDER)
         return run([BACKEND.interpreter, "-m", "backend", *arguments], cwd=None)
     except SetupError as error:

@@ -75,7 +75,7 @@ def run_cell(order: dict[str, Any]) -> dict[str, Any]:
         frame_start=first,
         frame_stop=stop,
         device="cpu",
-        overrides={"forecast.num_frames": AHEAD, "seed": trial["seed"], **dict(trial["changes"])},
+        overrides={"forecast.num_frames": AHEAD, "seed": trial["seed"], "follow_clip": False, **dict(trial["changes"])},
     )
     folder.create()
     folder.write_job(job)

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from backend.contract.job import PRESETS, preset_config, settable_keys
+from backend.contract.job import PRESETS, preset_config
 
 FRAMES = (75, 105)  # of 120: the camera has turned by 33 to 46 degrees, every scene shows smoke
 AHEAD = 9  # frames of the forecast
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1)
 NO_PRIOR = ("volume.use_prior", "false")
+FOLLOWING = {"follow_clip": "true"}  # elsewhere the settings stand as they are: they are what is measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +94,14 @@ _TOGETHER = {
         {"volume.use_prior": "false"},
         {"visual.iterations": "6", "visual.num_particles": "2000"},
         {"visual.iterations": "1", "visual.num_particles": "8000"},
+        FOLLOWING,
     ),
     "preview": (
         {"visual.iterations": "10", "visual.mass_iterations": "4"},
         {"visual.num_particles": "12000", "visual.iterations": "3"},
         {"visual.num_particles": "12000", "visual.iterations": "12"},
         {"visual.num_particles": "24000", "visual.iterations": "24"},
+        FOLLOWING,
     ),
     "final": (
         {"visual.iterations": "8"},
@@ -107,15 +110,15 @@ _TOGETHER = {
         {"frames.working_size": "320"},
         {"volume.use_prior": "false"},
         {"visual.num_particles": "12000", "visual.iterations": "24"},
+        FOLLOWING,
     ),
 }
 
 
 def sweeps(*, threads: int, frames: tuple[int, int] = FRAMES) -> list[Sweep]:
     """threads: as many as there are processors to run on."""
-    settings = [(_value("preview", key), (), key, *more) for key, *more in _AROUND_PREVIEW if _is_setting(key)]
-    settings += [(_value("preview", key), (NO_PRIOR,), key, *more) for key, *more in _WITHOUT_PRIOR]
-    found = [_sweep(own, shared, key, stage, values, frames) for own, shared, key, stage, values in settings]
+    found = [_sweep((), key, stage, values, frames) for key, stage, values in _AROUND_PREVIEW]
+    found += [_sweep((NO_PRIOR,), key, stage, values, frames) for key, stage, values in _WITHOUT_PRIOR]
     last = frames[1] - (frames[1] - frames[0]) // 2  # lengths are scored on the frames that all of them hold
     starts = [start for start in (last, frames[0], 2 * frames[0] - frames[1]) if start >= 0]
     lengths = [Trial(preset="preview", frames=(start, frames[1]), scored_from=last) for start in starts]
@@ -142,11 +145,9 @@ def with_donors(trials: Iterable[Trial]) -> list[Trial]:
     return list(dict.fromkeys(found for trial in trials for found in (trial.donor, trial) if found is not None))
 
 
-def _sweep(
-    own: object, shared: tuple[tuple[str, str], ...], key: str, stage: str, values: tuple[str, ...], frames: tuple[int, int]
-) -> Sweep:
-    """own: the preset's value. shared: what all points have besides."""
-    middle = str(own).lower()
+def _sweep(shared: tuple[tuple[str, str], ...], key: str, stage: str, values: tuple[str, ...], frames: tuple[int, int]) -> Sweep:
+    """shared: what all points have besides. The preset's own value is among them."""
+    middle = str(_value("preview", key)).lower()
     base = Trial(preset="preview", changes=shared, frames=frames, scored_from=frames[0])
     others = [value for value in values if value != middle]
     points = [(middle, base), *((value, replace(base, changes=(*shared, (key, value)))) for value in others)]
@@ -161,7 +162,3 @@ def _value(preset: str, key: str) -> object:
     for name in key.split("."):
         found = getattr(found, name)
     return found
-
-
-def _is_setting(key: str) -> bool:
-    return key in settable_keys(preset_config(PRESETS[0]))

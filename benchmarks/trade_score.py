@@ -17,9 +17,9 @@ from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.io.vdb import read_vdb
 from backend.score import baselines, measures
-from backend.score.evaluate import camera_axes
 from backend.score.particles import ParticlePrediction
 from backend.score.truth_set import TruthSet, Volume, read_truth_set
+from backend.score.volumes import camera_axes
 from backend.stages.export import vdb_path
 
 VIEWS = (INPUT_VIEW, "nvs", "side")
