@@ -11,6 +11,7 @@ from backend.contract.errors import BackendError
 from backend.contract.job import ExtractionConfig
 from backend.fit import matte, on_black
 from backend.fit.artist_masks import ArtistMasks, read_masks
+from backend.fit.exposure import watched
 from backend.fit.series import Series
 from backend.reporting import Report
 
@@ -170,8 +171,9 @@ def _matte(
 def _streamed(
     frames: Series[np.ndarray], report: Report, layer: Callable[[int], np.ndarray], *, done: int = 0
 ) -> Iterator[np.ndarray]:
-    for index in range(len(frames)):
-        yield layer(index).astype(np.float32)
+    layers = (layer(index).astype(np.float32) for index in range(len(frames)))
+    for index, image in enumerate(watched(layers, report)):
+        yield image
         report.progress(done + index + 1, done + len(frames))
 
 

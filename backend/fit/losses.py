@@ -58,7 +58,8 @@ def frequency_as_published(picture: np.ndarray, target: np.ndarray) -> tuple[flo
     As printed: a difference of nearly 2 pi counts as large although the angles are nearly equal, the phase of an empty bin is
     chance, and the amplitude's part grows with the picture. Where |F| is below 1e-12 the slopes are taken as 0.
     """
-    _checked(picture, target)
+    if _checked(picture, target).size == 0:
+        return 0.0, np.zeros(picture.shape)
     ours, theirs = (np.fft.fft2(np.asarray(values, np.float64)) for values in (picture, target))
     size = max(ours.size, 1)
     amplitude, difference = np.abs(ours), np.abs(ours) - np.abs(theirs)
@@ -77,6 +78,8 @@ def frequency(picture: np.ndarray, target: np.ndarray, *, band: tuple[float, flo
     0 where the two spectra are equal. Raises ValueError for a band that holds no frequency of the picture.
     """
     difference = _checked(picture, target)
+    if difference.size == 0:
+        return 0.0, np.zeros(picture.shape)
     height, width = difference.shape[-2:]
     rows, columns = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
     cycles = np.hypot(rows, columns)
@@ -96,10 +99,13 @@ def warm_up(iteration: int, length: int) -> float:
 
 
 def _checked(picture: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The difference, float64. Raises ValueError where the two do not fit."""
+    """The difference, float64. Raises ValueError where the two do not fit, or hold what is no number."""
     if picture.shape != target.shape or picture.ndim != 3:
         raise ValueError(f"pictures of {picture.shape} and {target.shape} cannot be compared; both must be [K, H, W]")
-    return np.asarray(picture, np.float64) - np.asarray(target, np.float64)
+    difference = np.asarray(picture, np.float64) - np.asarray(target, np.float64)
+    if not np.isfinite(difference).all():
+        raise ValueError("a picture holds NaN or infinity")
+    return difference
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
