@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,9 +66,37 @@ def read_result(job_folder: str | os.PathLike[str]) -> Result:
             raise ValueError("another format version")
         for name in ("bounds", "smoke_color", "buoyancy"):
             data[name] = _tuples(data[name])
-        return Result(**data)
+        return _checked(Result(**data))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise BackendError("result_unreadable", f"{path} cannot be read: {error}.", hint="Run the job again.") from error
+
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (int, float),
+    "bool": (bool,),
+    "str | None": (str, type(None)),
+    "list[dict[str, str]]": (list,),
+}
+
+
+def _checked(result: Result) -> Result:
+    """The result itself. Raises ValueError where an entry is of another type than it should be, or a count is negative."""
+    for item in dataclasses.fields(Result):
+        value, kinds = getattr(result, item.name), _KINDS.get(str(item.type))
+        if kinds is not None and (not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds)):
+            raise ValueError(f"{item.name} is {type(value).__name__} where {item.type} is expected")
+    numbers = (result.fps, result.voxel_size, *result.smoke_color, *result.buoyancy, *result.bounds[0], *result.bounds[1])
+    counts = (result.num_frames, result.num_forecast, result.frame_start)
+    if not all(math.isfinite(number) for number in numbers) or min(counts) < 0:
+        raise ValueError("a number is not finite, or a count is negative")
+    if (len(result.smoke_color), len(result.buoyancy), *map(len, result.bounds)) != (3, 3, 3, 3) or result.fps <= 0.0:
+        raise ValueError("a vector has other than three numbers, or there is no frame rate")
+    for entry in result.warnings:
+        if not (isinstance(entry, dict) and all(isinstance(word, str) for pair in entry.items() for word in pair)):
+            raise ValueError("a warning is not made of words")
+    return result
 
 
 def _tuples(value: Any) -> Any:

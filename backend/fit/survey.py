@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -23,6 +22,7 @@ from backend.io.images import linear_to_srgb
 from backend.io.video import Clip
 from backend.io.working_frames import has_premultiplied_alpha, reduced, working_size
 from backend.reporting import Report, SilentReport
+from backend.stopwatch import Stopwatch
 
 MAX_FRAMES = 48  # looked at, spread over the part that is decoded
 MAX_DECODED = 900  # frames; the end of a longer clip is not looked at
@@ -81,14 +81,14 @@ def survey(
     given: Cameras | None = None,  # of the whole clip
 ) -> Survey:
     """Looks at up to 48 frames. Raises BackendError, as a run would, where they show no smoke or cameras do not fit."""
-    began = time.perf_counter()
+    whole = Stopwatch()
     size = working_size(clip, FramesConfig(working_size=MAX_SIDE))
     numbers, frames, decode, reduce = _sampled(clip, size, start, stop, report)
-    before = time.perf_counter()
+    watch = Stopwatch()
     layer = extract(frames, config.extraction, SilentReport(), has_alpha=clip.has_alpha)
-    prepared = time.perf_counter()
+    preparing, watch = watch.seconds(), Stopwatch()
     layers = list(layer.frames)
-    extracting = (time.perf_counter() - prepared) / len(layers)
+    extracting = watch.seconds() / len(layers)
     shares = np.array([float(np.mean(image[..., 3] > SMOKE_OPACITY)) for image in layers])
     smoke = np.concatenate([image[..., 3][image[..., 3] > SMOKE_OPACITY] for image in layers])
     some = layers[:: max(1, len(layers) // _DETAIL_FRAMES)]
@@ -110,7 +110,7 @@ def survey(
         turn=0.0 if cameras is None or cameras.is_still else turned_about(make_scene(layers, cameras)),
         has_cameras=is_given,
         motion=motion,
-        pace=Pace(decode=decode, reduce=reduce, prepare=prepared - before, extract=extracting, whole=time.perf_counter() - began),
+        pace=Pace(decode=decode, reduce=reduce, prepare=preparing, extract=extracting, whole=whole.seconds()),
     )
 
 
@@ -128,14 +128,14 @@ def _sampled(
     numbers = np.unique(np.linspace(start, last - 1, count).round().astype(int)).tolist()
     is_premultiplied = clip.has_alpha and has_premultiplied_alpha(clip.frames(start, last))
     wanted, frames, reducing = set(numbers), [], 0.0
-    began = time.perf_counter()
+    watch = Stopwatch()
     for index, image in enumerate(clip.frames(start, last), start=start):
         if index in wanted:
-            before = time.perf_counter()
+            part = Stopwatch()
             frames.append(reduced(image, size, is_premultiplied=is_premultiplied))
-            reducing += time.perf_counter() - before
+            reducing += part.seconds()
         report.progress(index + 1 - start, last - start)
-    decoding = time.perf_counter() - began - reducing
+    decoding = max(watch.seconds() - reducing, 0.0)
     return numbers, frames, decoding / (last - start), reducing / len(frames)
 
 

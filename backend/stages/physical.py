@@ -23,6 +23,7 @@ from backend.fit.depths import Depths
 from backend.fit.follow import drawn_near
 from backend.fit.guide import Guide
 from backend.fit.lift import gain_with_density, shared_out
+from backend.fit.limits import warn_of_substeps
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VolumeRecord
@@ -57,7 +58,7 @@ def run(
         yield from published_physical.run(layers, cameras, settings, report, learns_buoyancy=learns, seed=seed, done=done)
         return
     scene = make_scene(layers, cameras)
-    fit = _Fit(scene, layers, config, seed, Depths(scene, layers, volumes))
+    fit = _Fit(scene, layers, config, seed, Depths(scene, layers, volumes), report)
     first = len(done)
     record = done[first - 1] if first else None
     for frame in range(first, len(layers)):
@@ -70,8 +71,11 @@ def run(
 class _Fit:
     """The parts of the filter that do not change over time."""
 
-    def __init__(self, scene: Scene, layers: Series[np.ndarray], config: PhysicalConfig, seed: int, depths: Depths) -> None:
+    def __init__(
+        self, scene: Scene, layers: Series[np.ndarray], config: PhysicalConfig, seed: int, depths: Depths, report: Report
+    ) -> None:
         self.scene = scene
+        self.report = report
         self.layers = layers
         self.config = config
         self.supply = make_supply(
@@ -118,6 +122,7 @@ class _Fit:
         dt = self.scene.seconds_per_frame
         parameters = replace(self.parameters, buoyancy=tuple(record.buoyancy))
         state, taken = fluids.step(as_fluid(record), parameters, dt)
+        warn_of_substeps(self.report, taken, len(record.positions), allowed=parameters.max_substeps)
         predicted = state.positions
         wanted, confidence = self._observed(record.positions, frame - 1)
         gain = self.config.flow_gain * confidence[:, None]

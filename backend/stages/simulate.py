@@ -15,6 +15,7 @@ from backend.contract.errors import BackendError
 from backend.contract.job import PhysicalConfig
 from backend.fit.carry import as_fluid, carry, with_velocities
 from backend.fit.lift import wind_of
+from backend.fit.limits import warn_of_substeps
 from backend.fit.population import take
 from backend.fit.replay import births_at_foot, born_again
 from backend.fit.series import Series
@@ -76,7 +77,8 @@ def run(
     reach = LIFETIME_REACH * float((high - low).max())
     for step in range(rollout.num_frames):
         report.progress(step, rollout.num_frames)
-        state, _ = fluids.step(as_fluid(record), parameters, seconds)
+        state, taken = fluids.step(as_fluid(record), parameters, seconds)
+        warn_of_substeps(report, taken, len(record.positions), allowed=parameters.max_substeps)
         record = replace(record, positions=state.positions, velocities=state.velocities)
         look = carry(look, record, seconds=seconds)
         record = born_again(record, emitted[0], step)

@@ -71,7 +71,30 @@ def test_every_required_entry_is_required(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"format_version": 2}, {"other": 1}, {"bounds": ["a"]}, {"buoyancy": None}, {"smoke_color": {}}]
+    "changes",
+    [
+        {"format_version": 2},
+        {"other": 1},
+        {"bounds": ["a"]},
+        {"bounds": [[0.0, 0.0], [1.0, 1.0]]},
+        {"bounds": [[0.0, 0.0, 0.0]] * 3},
+        {"buoyancy": None},
+        {"buoyancy": [0.0, 1.0]},
+        {"smoke_color": {}},
+        {"num_frames": "24"},
+        {"num_frames": 24.0},
+        {"num_frames": True},
+        {"num_forecast": -1},
+        {"fps": "24"},
+        {"fps": 0.0},
+        {"has_color": 1},
+        {"particles": None},
+        {"background_plate": 3},
+        {"warnings": ["a"]},
+        {"warnings": [{"code": 1}]},
+        {"warnings": {}},
+        {"fingerprint": None},
+    ],
 )
 def test_what_else_is_refused(tmp_path, changes):
     (tmp_path / "result.json").write_text(json.dumps(json.loads(RESULT.to_json()) | changes), encoding="utf-8")
@@ -101,3 +124,9 @@ def test_any_bytes_are_refused(tmp_path, data):
 
 def test_vdb_names_count_from_one_with_four_digits():
     assert VDB_NAME.format(1) == "smoke_0001.vdb"
+
+
+@pytest.mark.parametrize("changes", [{"fps": 24}, {"background_plate": None}, {"warnings": []}, {"voxel_size": 1}])
+def test_what_is_as_good_is_taken(tmp_path, changes):
+    (tmp_path / "result.json").write_text(json.dumps(json.loads(RESULT.to_json()) | changes), encoding="utf-8")
+    assert read_result(tmp_path) == dataclasses.replace(RESULT, **changes)
