@@ -1,6 +1,7 @@
-"""A finished job as a .blend and a preview picture, from the command line, with Blender's Python or the bpy wheel:
+"""A finished job as a .blend and pictures by Cycles, from the command line, with Blender's Python or the bpy wheel:
 
 python addon/scene/build_blend.py --job DIR --blend FILE --preview PNG [--frame N] [--relight R] [--samples N]
+python addon/scene/build_blend.py --job DIR --layers DIR --layer-frames 1,40,80        the smoke alone, for measurements
 """
 
 from __future__ import annotations
@@ -8,8 +9,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
+from typing import Any
 
 PACKAGE = "wildsmoke"
 
@@ -53,6 +56,24 @@ def _build(options: argparse.Namespace) -> None:
             longest_side=options.longest_side,
             plate=plate,
         )
+    if options.layers is not None:
+        print(f"blender {bpy.app.version_string}", flush=True)
+        for number in options.layer_frames:
+            path = options.layers / f"{number:04d}.npy"
+            if not path.exists():
+                _keep_layer(path, preview.render_layer, scene, options, number)
+            print(f"layer {number}", flush=True)
+
+
+def _keep_layer(path: Path, render_layer: Any, scene: Any, options: argparse.Namespace, number: int) -> None:
+    """[H, W, 4] float32 linear premultiplied as a NumPy file, whole or not at all: who asks again goes on behind it."""
+    import numpy as np
+
+    layer = render_layer(scene, frame=number, samples=options.samples, longest_side=options.longest_side)
+    part = path.with_name(path.name + ".part")
+    with open(part, "wb") as file:
+        np.save(file, layer)
+    os.replace(part, path)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -63,8 +84,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frame", type=int, help="Blender's frame, from 1; nine tenths through the clip by default")
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--longest-side", type=int, default=0, help="px of the preview; 0: the clip's own size")
+    parser.add_argument("--layers", type=Path, help="a folder for the smoke alone, %%04d.npy by Blender's frame")
+    parser.add_argument("--layer-frames", type=_numbers, default=[], help="Blender's frames, from 1, such as 1,40,80")
     parser.add_argument("--relight", type=float, help="0: as filmed, 1: lit by the scene")
     return parser
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(part) for part in text.split(",")]
 
 
 def _own_arguments() -> list[str]:

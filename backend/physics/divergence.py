@@ -39,20 +39,31 @@ class Divergence:
 @njit(cache=True, parallel=True, error_model="numpy")
 def _normal_equations(positions, velocities, starts, indices, sigma, normal, moment):
     """Writes normal [N, 3, 3] = A^T W A and moment [N, 3, 3] = A^T W B."""
+    scale = -1.0 / (2.0 * sigma * sigma)
     for i in prange(positions.shape[0]):
-        normal[i, :, :] = 0.0
-        moment[i, :, :] = 0.0
+        # Sums in variables of their own stay in registers, which arrays do not.
+        xx = xy = xz = yy = yz = zz = 0.0
+        xu = xv = xw = yu = yv = yw = zu = zv = zw = 0.0
         for k in range(starts[i], starts[i + 1]):
             j = indices[k]
-            squared = 0.0
-            for axis in range(3):
-                squared += (positions[j, axis] - positions[i, axis]) ** 2
-            weight = math.exp(-squared / (2.0 * sigma * sigma))
-            for row in range(3):
-                offset = weight * (positions[j, row] - positions[i, row])
-                for column in range(3):
-                    normal[i, row, column] += offset * (positions[j, column] - positions[i, column])
-                    moment[i, row, column] += offset * (velocities[j, column] - velocities[i, column])
+            x = positions[j, 0] - positions[i, 0]
+            y = positions[j, 1] - positions[i, 1]
+            z = positions[j, 2] - positions[i, 2]
+            u = velocities[j, 0] - velocities[i, 0]
+            v = velocities[j, 1] - velocities[i, 1]
+            w = velocities[j, 2] - velocities[i, 2]
+            weight = math.exp(scale * (x * x + y * y + z * z))
+            wx, wy, wz = weight * x, weight * y, weight * z
+            xx, xy, xz, yy, yz, zz = xx + wx * x, xy + wx * y, xz + wx * z, yy + wy * y, yz + wy * z, zz + wz * z
+            xu, xv, xw = xu + wx * u, xv + wx * v, xw + wx * w
+            yu, yv, yw = yu + wy * u, yv + wy * v, yw + wy * w
+            zu, zv, zw = zu + wz * u, zv + wz * v, zw + wz * w
+        normal[i, 0, 0], normal[i, 0, 1], normal[i, 0, 2] = xx, xy, xz
+        normal[i, 1, 0], normal[i, 1, 1], normal[i, 1, 2] = xy, yy, yz
+        normal[i, 2, 0], normal[i, 2, 1], normal[i, 2, 2] = xz, yz, zz
+        moment[i, 0, 0], moment[i, 0, 1], moment[i, 0, 2] = xu, xv, xw
+        moment[i, 1, 0], moment[i, 1, 1], moment[i, 1, 2] = yu, yv, yw
+        moment[i, 2, 0], moment[i, 2, 1], moment[i, 2, 2] = zu, zv, zw
 
 
 def _fit(positions: np.ndarray, velocities: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

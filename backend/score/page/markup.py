@@ -25,7 +25,7 @@ a { color: var(--c0); }
 .scroll { overflow-x: auto; margin: .6rem 0 1.2rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
 caption { text-align: left; padding-bottom: .4rem; caption-side: top; max-width: 60rem; }
-th, td { padding: .28rem .7rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+th, td { padding: .28rem .55rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
 th:first-child, td:first-child, th.text, td:has(.text) { text-align: left; }
 thead th { vertical-align: bottom; color: var(--soft); font-weight: 600; }
 tbody th { font-weight: 400; }

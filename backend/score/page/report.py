@@ -10,7 +10,8 @@ from typing import Any
 from backend.io.atomic import write_text
 from backend.reporting import Report
 from backend.score.finished_job import FinishedJob
-from backend.score.page import markup, views, volumes
+from backend.score.page import cycles, markup, views, volumes
+from backend.score.relight import RelightConfig
 from backend.score.truth_set import Truth
 
 _READING = (
@@ -28,8 +29,16 @@ _READING = (
 )
 
 
-def write_report(path: Path, scores: Mapping[str, Any], job: FinishedJob, truth: Truth, *, report: Report) -> None:
-    """One HTML file, whole or absent. scores: as scores_of gives them."""
+def write_report(
+    path: Path,
+    scores: Mapping[str, Any],
+    job: FinishedJob,
+    truth: Truth,
+    *,
+    relight: RelightConfig | None = None,
+    report: Report,
+) -> None:
+    """One HTML file, whole or absent. scores: as scores_of gives them; relight: where the pictures of Cycles are kept."""
     title = f"{truth.name}: evaluation"
     shown = []
     total = len(truth.frames)
@@ -41,7 +50,7 @@ def write_report(path: Path, scores: Mapping[str, Any], job: FinishedJob, truth:
         markup.section("summary", "Summary", views.summary(scores), _not_measured(scores)),
         markup.section("curves", "Over angle, time and horizon", views.curves(scores, truth)),
         markup.section("pictures", "Pictures", _colours(), *shown),
-        _relight(scores),
+        cycles.shown(scores, truth, job.folder.path, relight) if relight is not None else "",
         _volumes(scores, job, truth),
         markup.section("motion", "Motion", _motion(scores)),
         markup.section("views", "Every answer in every view", views.tables(scores)),
@@ -60,7 +69,7 @@ def _header(scores: Mapping[str, Any], truth: Truth) -> str:
     links = "".join(
         f'<li><a href="#{name}">{name}</a></li>'
         for name in names
-        if name not in ("relight", "volumes") or scores.get(name.rstrip("s"))
+        if name not in ("relight", "volumes") or scores.get(name.removesuffix("s"))
     )
     return (
         f'<header><h1>{escape(truth.name)}</h1><p class="soft">Reconstruction against the truth. {escape(made)}. '
@@ -82,10 +91,6 @@ def _not_measured(scores: Mapping[str, Any]) -> str:
         return ""
     lines = "".join(f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in missing.items())
     return f'<div class="note"><strong>Not measured</strong><ul>{lines}</ul></div>'
-
-
-def _relight(scores: Mapping[str, Any]) -> str:
-    return ""
 
 
 def _volumes(scores: Mapping[str, Any], job: FinishedJob, truth: Truth) -> str:

@@ -54,7 +54,7 @@ def title_of(view: str) -> str:
 
 def views_of(scores: Mapping[str, Any]) -> dict[str, Answers]:
     """Those that are known by name first, futures after what was seen."""
-    found = {name: value for name, value in scores.items() if isinstance(value, dict) and OURS in value}
+    found = {name: value for name, value in scores.items() if name != "relight" and isinstance(value, dict) and OURS in value}
     known = list(_TITLES)
     order = sorted(found, key=lambda name: (name.startswith("future_"), known.index(name) if name in known else len(known)))
     return {name: found[name] for name in order}
