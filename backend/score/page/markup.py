@@ -27,7 +27,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 caption { text-align: left; padding-bottom: .4rem; caption-side: top; max-width: 60rem; }
 th, td { padding: .28rem .55rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
 th:first-child, td:first-child, th.text, td:has(.text) { text-align: left; }
-thead th { vertical-align: bottom; color: var(--soft); font-weight: 600; }
+thead th { vertical-align: bottom; color: var(--soft); font-weight: 600; white-space: normal; max-width: 8.5rem; }
 tbody th { font-weight: 400; }
 tr.ours th, tr.ours td { font-weight: 650; background: var(--well); }
 .good { color: var(--good); font-weight: 600; } .bad { color: var(--bad); font-weight: 600; }

@@ -16,10 +16,10 @@ from backend.score.truth_set import Truth
 
 _READING = (
     "Every picture is the smoke alone on black, sRGB-coded. PSNR has the peak 1 and counts at most 50 dB a frame; in smoke: over "
-    "the true smoke and four pixels around it. On black much of a picture is easy, so a figure means nothing by itself: the "
-    "answers beside ours need no reconstruction. copy, mirror: the input picture of the same moment as it is, or mirrored. "
-    "billboard: the input picture on a plane through the smoke. still mean: our pictures' mean over time. frozen: of the last "
-    "seen moment. black, grey: as they are called.",
+    "the true smoke and four pixels around it; global: of the mean squared error of all frames. On black much of a picture is "
+    "easy, so a figure means nothing by itself: the answers beside ours need no reconstruction. copy, mirror: the input picture "
+    "of the same moment as it is, or mirrored. billboard: the input picture on a plane through the smoke. still mean: our "
+    "pictures' mean over time. frozen: of the last seen moment. black, grey: as they are called.",
     "SSIM: of Wang et al. 2004. LPIPS and ST-LPIPS: of Zhang et al. 2018 and Ghildyal and Liu 2022, over at most 8 frames of a "
     "view; lower is better. dtSSD: of Erofeev et al. 2015, how far the change from picture to picture is from the true one; "
     "lower is better, and what never moves has little to be blamed for. change: the size of our changes over that of the true "

@@ -19,7 +19,7 @@ from backend.score.truth_set import Truth
 FIGURES = {  # figure -> heading, digits
     "full_db": ("PSNR, dB", 2),
     "smoke_db": ("PSNR in smoke, dB", 2),
-    "global_db": ("PSNR of all frames&rsquo; error, dB", 2),
+    "global_db": ("global PSNR, dB", 2),
     "first_db": ("first third, dB", 2),
     "middle_db": ("middle, dB", 2),
     "last_db": ("last, dB", 2),
