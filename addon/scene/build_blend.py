@@ -58,6 +58,7 @@ def _build(options: argparse.Namespace) -> None:
         )
     if options.layers is not None:
         print(f"blender {bpy.app.version_string}", flush=True)
+        options.layers.mkdir(parents=True, exist_ok=True)
         for number in options.layer_frames:
             path = options.layers / f"{number:04d}.npy"
             if not path.exists():

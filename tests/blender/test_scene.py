@@ -74,6 +74,21 @@ def test_the_script_makes_a_blend_and_a_preview(job: Path, tmp_path: Path, wheel
     assert "holds no finished job" in done.stderr
 
 
+def test_the_script_keeps_the_smoke_alone(job: Path, tmp_path: Path, wheel: str, find_wheel_python) -> None:
+    """What an evaluation scores; a picture that is there already is not drawn again."""
+    command = [find_wheel_python(wheel), CHECKOUT / "addon" / "scene" / "build_blend.py", "--job", job, "--samples", "4"]
+    command += ["--layers", tmp_path / "layers", "--layer-frames", "2,5", "--longest-side", "80"]
+    (tmp_path / "layers").mkdir()
+    (tmp_path / "layers" / "0002.npy").write_bytes(b"drawn before")
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [line for line in done.stdout.splitlines() if line.startswith("layer")] == ["layer 2", "layer 5"]
+    assert sorted(path.name for path in (tmp_path / "layers").iterdir()) == ["0002.npy", "0005.npy"]
+    layer = np.load(tmp_path / "layers" / "0005.npy")
+    assert layer.shape == (80, 60, 4) and np.isfinite(layer).all() and 0.3 < layer[..., 3].max() <= 1.0
+    assert np.percentile(layer[..., 3], 5) < 0.01, "nothing but smoke"
+
+
 def make_job(folder: Path) -> None:
     """particles.h5, the VDB sequence, cameras.json, a plate, result.json; expected.npz: opacity and colour of one frame."""
     cameras = cameras_around()
