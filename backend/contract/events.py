@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 1 << 20  # a longer line is not an event
+LARGEST_COUNT = 2**63 - 1  # shares of larger ones overflow
 MAX_PROGRESS_PER_SECOND = 10.0
 
 
@@ -157,6 +158,8 @@ def _checked(name: str, value: Any, annotation: str) -> Any:
             raise ProtocolError(f"{name}: not all numbers")
         if isinstance(number, float) and not math.isfinite(number):
             raise ProtocolError(f"{name}: not finite")
+        if isinstance(number, int) and abs(number) > LARGEST_COUNT:
+            raise ProtocolError(f"{name}: beyond 64 bits")
     return value
 
 

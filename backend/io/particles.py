@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,16 @@ import numpy as np
 
 from backend.contract.cameras import Cameras, parse_cameras
 from backend.contract.errors import BackendError
+from backend.contract.light import Light, parse_light
 from backend.contract.units import PARTICLES_FORMAT_VERSION, PARTICLES_UNITS
 from backend.io.atomic import storage_errors, whole_file
 from backend.io.hdf5_sink import Hdf5Sink
+from backend.io.header_digest import DIGEST, header_digest
 
 FORMAT_NAME = "wildsmoke particles"
 Vector = tuple[float, float, float]
 
+_LIGHT = "light_"  # attributes of physics
 _CHUNK_ROWS = 8192
 _MAX_COMPRESSION = 1100  # deflate reaches 1032:1, so a file cannot hold more bytes than this many times its size
 _COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {  # name -> type on disk, shape of one particle
@@ -62,6 +65,7 @@ class ParticlesInfo:
 
     frame_start: the clip's frame that is frame 0 here. gravity: m/s^2, world. buoyancy: learned, m/s^2;
     buoyancy_uncertainty: its standard deviation, m/s^2. fluid: parameters of the simulation, unit in each name.
+    light: the clip's, where its smoke shows one.
     provenance: version, source fingerprint, settings; JSON values, no times and no paths, so that equal runs give
     equal bytes. fingerprint: names the settings and inputs that this file follows from.
     """
@@ -72,6 +76,7 @@ class ParticlesInfo:
     buoyancy: Vector = (0.0, 0.0, 0.0)
     buoyancy_uncertainty: Vector = (0.0, 0.0, 0.0)
     fluid: Mapping[str, float] = field(default_factory=dict)
+    light: Light | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     fingerprint: str = ""
 
@@ -152,6 +157,7 @@ class ParticlesWriter:
         _write_cameras(file.create_group("cameras"), info.cameras)
         _write_physics(file.create_group("physics"), info)
         _write_text(file, "provenance", json.dumps(dict(info.provenance), sort_keys=True, allow_nan=False))
+        file.attrs[DIGEST] = header_digest(file)
         self._check_storage()
         self._is_finished = True
 
@@ -249,9 +255,14 @@ class Particles:
             buoyancy=_vector(physics["buoyancy"]),
             buoyancy_uncertainty=_vector(physics["buoyancy_uncertainty"]),
             fluid={name: float(value) for name, value in sorted(file["physics/fluid"].attrs.items())},
+            light=_read_light(physics),
             provenance=json.loads(_read_text(file, "provenance", self._path)),
             fingerprint=str(file.attrs["fingerprint"]),
         )
+        for name in ("camera_to_world", "intrinsics"):
+            _check_size(file["cameras"][name], self._path)
+        if DIGEST in file.attrs and str(file.attrs[DIGEST]) != header_digest(file):
+            raise ValueError("its cameras, counts or provenance are not as they were written")
 
     def _checked_offsets(self, file: Any) -> np.ndarray:
         """offsets [T + 1], after a comparison of every count with what the file can hold."""
@@ -338,6 +349,17 @@ def _write_physics(group: Any, info: ParticlesInfo) -> None:
     fluid = group.create_group("fluid")
     for name in sorted(info.fluid):
         fluid.attrs[name] = float(info.fluid[name])
+    _write_light(group.attrs, info.light)
+
+
+def _write_light(attributes: Any, light: Light | None) -> None:
+    for name, value in asdict(light).items() if light else ():
+        attributes[_LIGHT + name] = np.array(value, "<f8")
+
+
+def _read_light(attributes: Any) -> Light | None:
+    found = {name.removeprefix(_LIGHT): attributes[name].tolist() for name in attributes if name.startswith(_LIGHT)}
+    return parse_light(found) if found else None
 
 
 def _write_text(group: Any, name: str, text: str) -> None:

@@ -85,10 +85,12 @@ def look(
 ) -> Window:
     """What is known about `frame`. depth_at: frame -> optical depth [h, w]; view_at: frame -> its view at that size.
 
-    source [3] m: what the smoke rises from.
+    source [3] m: what the smoke rises from. Raises ValueError where an image holds what is no number.
     """
     frames = [min(max(frame + offset * stride, 0), num_frames - 1) for offset in OFFSETS]
     images = np.stack([depth_at(number) for number in frames]).astype(np.float32)
+    if not np.isfinite(images).all():
+        raise ValueError("optical depths hold NaN or infinity")
     total, squares = images.sum(dtype=np.float64), np.square(images, dtype=np.float64).sum()
     scale = float(squares / total) if total > 0 else 1.0
     views = [view_at(number) for number in frames]

@@ -14,19 +14,20 @@ from backend.contract import events
 from backend.contract.events import ProtocolError, decode, encode, is_cancel
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
+count = st.integers(-events.LARGEST_COUNT, events.LARGEST_COUNT)
 text = st.text(st.characters(exclude_categories=["Cs"]))
 every_event = st.one_of(
-    st.builds(events.Hello, protocol=st.integers(), version=text, device=text),
-    st.builds(events.Stage, name=text, index=st.integers(), count=st.integers(), skipped=st.booleans()),
+    st.builds(events.Hello, protocol=count, version=text, device=text),
+    st.builds(events.Stage, name=text, index=count, count=count, skipped=st.booleans()),
     st.builds(
         events.Progress,
         stage=text,
-        step=st.integers(),
-        total=st.integers(),
+        step=count,
+        total=count,
         seconds_left=st.none() | finite,
         metrics=st.dictionaries(text, finite),
     ),
-    st.builds(events.Artifact, kind=text, path=text, frame=st.none() | st.integers()),
+    st.builds(events.Artifact, kind=text, path=text, frame=st.none() | count),
     st.builds(events.Warning, code=text, message=text),
     st.builds(events.Done, result=text, seconds=finite),
     st.builds(events.Error, code=text, message=text, hint=text, stage=st.none() | text),

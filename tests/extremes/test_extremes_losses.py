@@ -37,8 +37,8 @@ def test_equal_pictures(table):
                 off = abs(value - 1.0) if name == "ssim" else abs(value)
                 worst = max(worst, off, float(np.abs(gradient).max()))
     table.row(
-        "equal pictures", tried=f"{len(ALL)} losses, {len(SIZES)} sizes, black to white and noise", happens="no loss and no gradient",
-        measure="largest loss or gradient", worst=worst, bound=1e-12,
+        "equal pictures", tried=f"{len(ALL)} losses, {len(SIZES)} sizes, black to white and noise",
+        happens="no loss and no gradient", measure="largest loss or gradient", worst=worst, bound=1e-12,
     )  # fmt: skip
 
 
@@ -51,8 +51,8 @@ def test_empty_pictures(table):
             worst = max(worst, abs(value - (name == "ssim")))
             tried += 1
     table.row(
-        "empty pictures", tried=f"no channel, no row, no column: {tried} cases", happens="no loss",
-        measure="largest loss", worst=worst, bound=0,
+        "empty pictures", tried=f"no channel, no row, no column: {tried} cases", happens="no loss", measure="largest loss",
+        worst=worst, bound=0,
     )  # fmt: skip
 
 
@@ -69,8 +69,8 @@ def test_gradients_at_odd_sizes_are_the_finite_differences(table):
                 continue  # a single pixel has a phase of 0, with a jump beside it
             worst = max(worst, abs(found - slope) / max(abs(slope), 1e-3))
     table.row(
-        "gradients at odd sizes", tried="1 x 1 to 31 x 17", happens="exact", measure="relative error against finite differences",
-        worst=worst, bound=1e-3,
+        "gradients at odd sizes", tried="1 x 1 to 31 x 17", happens="exact",
+        measure="relative error against finite differences", worst=worst, bound=1e-3,
     )  # fmt: skip
 
 
@@ -87,7 +87,8 @@ def test_any_brightness(table):
                 if name == "ssim":
                     worst = max(worst, abs(value))
     table.row(
-        "brightness", tried="0 and 1e-30 to 1e6", happens="values and gradients are finite", measure="largest |SSIM|", worst=worst, bound=1
+        "brightness", tried="0 and 1e-30 to 1e6", happens="values and gradients are finite", measure="largest |SSIM|",
+        worst=worst, bound=1,
     )  # fmt: skip
 
 
@@ -104,8 +105,8 @@ def test_flat_pictures_beyond_white_are_alike(table):
         worst=max(worst[level] for level in (1.0, 1e2, 1e4)), bound=1e-4,
     )  # fmt: skip
     table.row(
-        "flat pictures far beyond white", tried="1e6 times white", happens="digits of float64 begin to lack", measure="|SSIM - 1|",
-        worst=worst[1e6], bound=0.1,
+        "flat pictures far beyond white", tried="1e6 times white", happens="digits of float64 begin to lack",
+        measure="|SSIM - 1|", worst=worst[1e6], bound=0.1,
     )  # fmt: skip
 
 

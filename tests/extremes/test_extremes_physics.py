@@ -236,8 +236,9 @@ def test_a_thousand_steps_without_forces(table):
     np.testing.assert_array_equal(state.ids, start.ids)
     tried = f"1000 steps of {num:,} particles, squeezed, no forces"
     table.row(
-        "energy over a rollout", tried=tried, happens="never grows", measure="largest growth in a step", worst=growth, bound=1e-12
-    )
+        "energy over a rollout", tried=tried, happens="never grows", measure="largest growth in a step", worst=growth,
+        bound=1e-12,
+    )  # fmt: skip
     table.row(
         "momentum over a rollout", tried=tried, happens="kept", measure="lost / sum of speeds",
         worst=momentum_error(state, start), bound=1e-9,
@@ -263,9 +264,7 @@ def test_a_thousand_steps_with_forces(table):
         happens="ends at force over drag, 2 m/s", measure="mean speed up, off 2 m/s, relative",
         worst=abs(float(state.velocities[:, 2].mean()) / 2.0 - 1), bound=0.01,
     )  # fmt: skip
-    table.row(
-        "fastest particle over a rollout", tried="the same", happens="bounded", measure="m/s", worst=fastest, bound=3,
-    )  # fmt: skip
+    table.row("fastest particle over a rollout", tried="the same", happens="bounded", measure="m/s", worst=fastest, bound=3)
 
 
 # -- where and how large -----------------------------------------------------------------------------------------------
@@ -298,8 +297,9 @@ def test_a_world_far_away(table):
     there, _ = step(replace(there, positions=there.positions + 1e6), parameters, 0.04)
     worst = float(np.abs(there.positions - 1e6 - here.positions).max())
     table.row(
-        "distance of the world's origin", tried="1e6 m", happens="the same step", measure="difference, m", worst=worst, bound=1e-8
-    )
+        "distance of the world's origin", tried="1e6 m", happens="the same step", measure="difference, m", worst=worst,
+        bound=1e-8,
+    )  # fmt: skip
 
 
 # -- numbers that are none ---------------------------------------------------------------------------------------------
@@ -391,8 +391,8 @@ def test_single_precision_against_double(table):
         positions, _ = step_torch(*arrays, torch.as_tensor(state.ids), parameters, 0.01)
         worst[dtype] = float(np.abs(positions.numpy() - step(state, parameters, 0.01)[0].positions).max())
     table.row(
-        "compiled step against its twin, float64", tried="200 particles, squeezed", happens="they agree", measure="difference, m",
-        worst=worst[torch.float64], bound=1e-9,
+        "compiled step against its twin, float64", tried="200 particles, squeezed", happens="they agree",
+        measure="difference, m", worst=worst[torch.float64], bound=1e-9,
     )  # fmt: skip
     table.row(
         "compiled step against its twin, float32", tried="the same", happens="what float32 would cost", measure="difference, m",
@@ -408,10 +408,6 @@ def test_a_lone_particle_is_never_pushed(table):
         after, _ = step(state_of([[0.0, 0.0, 0.0]]), parameters, 0.1)
         worst = max(worst, float(np.abs(after.positions).max()))
     table.row(
-        "rest density about a lone particle",
-        tried="1e-6 to 1e6 of its own",
-        happens="stays",
-        measure="way, m",
-        worst=worst,
+        "rest density about a lone particle", tried="1e-6 to 1e6 of its own", happens="stays", measure="way, m", worst=worst,
         bound=0,
-    )
+    )  # fmt: skip

@@ -61,8 +61,9 @@ def test_no_gaussian_is_a_black_image(table):
         assert gradients.positions.shape == (0, 3)
         worst = max(worst, float(drawn.image.max()))
     table.row(
-        "no particle", tried="0 particles, three sizes of image", happens="black", measure="largest value", worst=worst, bound=0
-    )
+        "no particle", tried="0 particles, three sizes of image", happens="black", measure="largest value", worst=worst,
+        bound=0,
+    )  # fmt: skip
 
 
 def test_coincident_gaussians_add_up(table):
@@ -214,8 +215,8 @@ def test_a_gaussian_fades_in_behind_the_near_plane_without_a_step():
 def test_far_off_axis_nothing_grows_without_bound(table):
     peak = max(float(everything(one((x, 0.0, 0.05), 0.5, mass=0.01))[0].image[0].max()) for x in (3.0, 30.0, 3e3, 3e6, 3e9))
     table.row(
-        "far off the axis, near the camera", tried="x / z from 60 to 6e10", happens="the footprint is held at 1.3 of the picture",
-        measure="largest optical depth", worst=peak, bound=1e-6,
+        "far off the axis, near the camera", tried="x / z from 60 to 6e10",
+        happens="the footprint is held at 1.3 of the picture", measure="largest optical depth", worst=peak, bound=1e-6,
     )  # fmt: skip
 
 
@@ -290,8 +291,8 @@ def test_any_field_of_view(table):
             worst = max(worst, float(error))
     table.row(
         "field of view", tried="0.1 to 170 degrees, in the middle and at 0.7 of the edge",
-        happens="drawn by a first-order expansion",
-        measure="relative error of the mass against exact rays", worst=worst, bound=0.15,
+        happens="drawn by a first-order expansion", measure="relative error of the mass against exact rays", worst=worst,
+        bound=0.15,
     )  # fmt: skip
 
 
@@ -393,8 +394,8 @@ def test_single_precision_against_the_twin_in_double(table):
             error = np.abs(getattr(found, name) - gradient.numpy()).max() / np.abs(gradient.numpy()).max()
             worst_gradient = max(worst_gradient, float(error))
     table.row(
-        "float32 against float64", tried="splats of 1e-5 to 1e3 px", happens="the sum in float32 agrees with the twin in float64",
-        measure="error / largest value", worst=worst, bound=2e-5,
+        "float32 against float64", tried="splats of 1e-5 to 1e3 px",
+        happens="the sum in float32 agrees with the twin in float64", measure="error / largest value", worst=worst, bound=2e-5,
     )  # fmt: skip
     table.row(
         "float32 against float64, gradients", tried="the same, for every input", happens="they agree with autograd in float64",
