@@ -38,7 +38,7 @@ from benchmarks.reconstruction import SETS, UNTOUCHED, code_digest, machine, run
 from benchmarks.trade_cell import Meter
 
 RESULTS = CHECKOUT / "docs" / "results" / "decisions.json"
-FRAMES = (60, 80)  # there is smoke in every scene, and the camera goes nine degrees around it
+FRAMES = (60, 76)  # there is smoke in every scene, and the camera goes seven degrees around it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,10 +122,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--page", action="store_true", help="also docs/decisions.md")
-    parser.add_argument("--cell", help=argparse.SUPPRESS)
+    parser.add_argument("--cells", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
-    if given.cell:
-        run_cell(json.loads(given.cell))
+    if given.cells:
+        run_cells(json.loads(given.cells))
         return 0
     if given.out is None:
         parser.error("--out is missing")
@@ -133,8 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
     scenes = given.scenes or sorted(path.parents[1].name for path in given.source.glob(f"*/{TRUTH_FOLDER}/{TRUTH_FILE}"))
     for scene in scenes:
         folder = (given.source / scene).resolve()
-        for cell in cells_of(root, folder, preset=given.preset, frames=given.frames):
-            failures += not complete(cell)
+        failures += not complete(list(cells_of(root, folder, preset=given.preset, frames=given.frames)))
     results = gather(root, scenes, preset=given.preset, frames=given.frames)
     text = as_text(results)
     write_text(root / "results.json", text)
@@ -157,41 +156,48 @@ def cells_of(root: Path, scene: Path, *, preset: str, frames: tuple[int, int]) -
         yield Cell(**common, name=variant.name, changes=variant.on | variant.changes, base=variant.base)
 
 
-def complete(cell: Cell) -> bool:
-    """Make what is missing of a cell; whether it is there then."""
-    if cell.record.exists():
+def complete(cells: list[Cell]) -> bool:
+    """Make what is missing of a scene's cells, in one process of their own; whether all are there then."""
+    if all(cell.record.exists() for cell in cells):
         return True
-    base = None if cell.base is None else Cell(**{**_fields(cell), "name": cell.base, "base": None})
-    shutil.rmtree(cell.job, ignore_errors=True)
-    cell.job.parent.mkdir(parents=True, exist_ok=True)
-    if base is not None and base.job.is_dir():
-        shutil.copytree(base.job, cell.job)
-    order = {
-        **{name: str(value) if isinstance(value, Path) else value for name, value in _fields(cell).items()},
-        "donor": str(base.record) if base is not None else None,
-        "began": time.monotonic(),
-    }
-    command = [sys.executable, "-m", "benchmarks.decisions", "--cell", json.dumps(order)]
+    order = [{name: str(value) if isinstance(value, Path) else value for name, value in _fields(cell).items()} for cell in cells]
+    command = [sys.executable, "-m", "benchmarks.decisions", "--cells", json.dumps(order)]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=CHECKOUT, env=environment, check=False)
-    if cell.base is not None:
-        shutil.rmtree(cell.job, ignore_errors=True)
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, cwd=CHECKOUT, env=environment, check=False)
     if done.returncode != 0:
         words = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
-        print(f"{cell.scene.name} {cell.name}: {words}", file=sys.stderr, flush=True)
-        return False
-    print(cell.record.read_text(encoding="utf-8"), flush=True)
-    return True
+        print(f"{cells[0].scene.name}: {words}", file=sys.stderr, flush=True)
+    return done.returncode == 0
 
 
 def _fields(cell: Cell) -> dict[str, Any]:
     return {name: getattr(cell, name) for name in Cell.__dataclass_fields__}
 
 
-def run_cell(order: dict[str, Any]) -> None:
-    """In a process of its own: the job, then its scores, then the record."""
-    paths = {name: Path(order[name]) for name in ("root", "scene")}
-    cell = Cell(**{name: order[name] for name in Cell.__dataclass_fields__} | paths)
+def run_cells(orders: list[dict[str, Any]]) -> None:
+    """The cells of a scene that are missing, each after the one that it shares stages with."""
+    cells = [Cell(**{**order, "root": Path(order["root"]), "scene": Path(order["scene"])}) for order in orders]
+    bases = {cell.name: cell for cell in cells if cell.base is None}
+    for cell in cells:
+        base = None if cell.base is None else bases[cell.base]
+        if cell.record.exists() and (cell.base is not None or cell.job.is_dir()):
+            continue
+        shutil.rmtree(cell.job, ignore_errors=True)
+        cell.job.parent.mkdir(parents=True, exist_ok=True)
+        donor: dict[str, Any] = {}
+        if base is not None:
+            shutil.copytree(base.job, cell.job)
+            donor = json.loads(base.record.read_text(encoding="utf-8"))
+        write_text(cell.record, json.dumps(run_cell(cell, donor), allow_nan=False))
+        print(cell.record.read_text(encoding="utf-8"), flush=True)
+        if base is not None:
+            shutil.rmtree(cell.job)
+    for base in bases.values():
+        shutil.rmtree(base.job)
+
+
+def run_cell(cell: Cell, donor: dict[str, Any]) -> dict[str, Any]:
+    """The job, then its scores. donor: the record of the job whose stages it holds already, which cost what they did there."""
     first, stop = cell.frames
     folder = JobFolder(cell.job)
     job = Job(
@@ -204,28 +210,27 @@ def run_cell(order: dict[str, Any]) -> None:
     )
     folder.create()
     folder.write_job(job)
-    donor = json.loads(Path(order["donor"]).read_text(encoding="utf-8")) if order["donor"] else {}
-    meter = Meter(order["began"])
+    meter = Meter(time.monotonic())
     run_job(folder.path, meter, StopRequest())
-    stages = meter.stages(donor)
+    known = {"stages": {name: {"cpu_seconds": seconds} for name, seconds in donor.get("stages", {}).items()}}
+    stages = {name: stage["cpu_seconds"] for name, stage in meter.stages(known).items() if name != "start"}
 
     from benchmarks.trade_score import score_window  # after the measurement: it is no part of the job
 
     scores = score_window(folder, cell.scene, cell.root / "pictures", scored=(first, stop))
     decided = {item.name: {"value": item.value, "measured": item.measured} for item in read_decisions(folder.path).decisions}
-    record = {
+    return {
         "scene": cell.scene.name,
         "untouched": cell.scene.name in UNTOUCHED,
         "name": cell.name,
         "base": cell.base,
         "changes": cell.changes,
         "decisions": decided,
-        "cpu_seconds": round(sum(stage["cpu_seconds"] for stage in stages.values()), 2),
-        "stages": {name: stage["cpu_seconds"] for name, stage in stages.items()},
+        "cpu_seconds": round(sum(stages.values()), 2),
+        "stages": stages,
         "scores": scores,
         "code": code_digest(),
     }
-    write_text(cell.record, json.dumps(record, allow_nan=False))
 
 
 def gather(root: Path, scenes: list[str], *, preset: str, frames: tuple[int, int]) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from backend.contract.job import Config
 from backend.estimate.machine import HEIGHT, NUM_PARTICLES, WIDTH
 from backend.fit.survey import Survey
 
+ONE_HUE_SHARE = 0.65  # of the time that three channels take to be drawn and differentiated
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
@@ -90,7 +92,7 @@ def _physical(seen: Survey, config: Config, pixels: float) -> list[Term]:
     ]
     if way == "filtered":
         drawn = count * config.physical.correction_iterations
-        terms.append(Term(name="correction", kind="splat", amount=drawn * (particles + pixels)))
+        terms.append(Term(name="correction", kind="splat", amount=drawn * (particles + seen.smoke_share * pixels)))
         terms.append(Term(name="solver", kind="splat", amount=count * config.physical.solver_iterations * particles))
     return terms
 
@@ -102,11 +104,14 @@ def _visual(seen: Survey, config: Config, pixels: float, particles: float) -> li
         return [Term(name="published", kind="splat", amount=drawn * (particles + pixels))]
     drawn, weighed = count * config.visual.iterations, count * config.visual.mass_iterations
     way = "led" if asks_prior(config) else "filtered"
-    color = "full" if config.visual.color != "one_hue" else "one_hue"
+    channels = ONE_HUE_SHARE if config.visual.color == "one_hue" else 1.0
+    covered = seen.smoke_share * pixels
     return [
+        Term(name=f"{way}_frame", kind="pixels", amount=float(count)),
         Term(name=f"{way}_pixel", kind="pixels", amount=count * pixels),
         Term(name=f"{way}_particle", kind="splat", amount=count * particles),
-        Term(name=f"{color}_pixel", kind="splat", amount=drawn * pixels),
-        Term(name=f"{color}_particle", kind="splat", amount=drawn * particles),
-        Term(name="mass", kind="splat", amount=weighed * (particles + pixels)),
+        Term(name="drawn_pixel", kind="splat", amount=drawn * channels * covered),
+        Term(name="drawn_particle", kind="splat", amount=drawn * channels * particles),
+        Term(name="mass_pixel", kind="splat", amount=weighed * covered),
+        Term(name="mass_particle", kind="splat", amount=weighed * particles),
     ]
