@@ -55,6 +55,13 @@ def _standing_point(view: View) -> np.ndarray:
     return view.position + distance * forward
 
 
+def is_origin_seen(view: View) -> bool:
+    """Whether the world's origin is before the camera, in the picture or at most half a picture beside it."""
+    pixels, depth = view.project(np.zeros((1, 3)))
+    share = np.abs(pixels[0] / (view.width, view.height) - 0.5)
+    return bool(depth[0] > 0.0 and share.max() <= 1.0)
+
+
 def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.ndarray:
     """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 64 frames.
 

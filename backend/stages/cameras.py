@@ -17,8 +17,10 @@ from backend.contract.errors import BackendError
 from backend.contract.job import CamerasConfig
 from backend.fit import stabilise
 from backend.fit.camera_path import fitting
+from backend.fit.scene import is_origin_seen
 from backend.fit.series import Series
 from backend.fit.stabilise import ImageMotion
+from backend.geometry.camera import view_at
 from backend.reporting import Report
 
 _MAX_SAMPLES = 120
@@ -44,7 +46,14 @@ def run(
             "cameras_missing", "No cameras.json was given.", hint='Give one with --cameras, or set cameras.mode to "auto".'
         )
     if given is not None and config.mode != "still":
-        return fitting(given, num_frames, frame_start, size=size, fps=fps, report=report)
+        fitted = fitting(given, num_frames, frame_start, size=size, fps=fps, report=report)
+        if fitted.is_still and not is_origin_seen(view_at(fitted, 0)):
+            report.warning(
+                "camera_misses_origin",
+                "The given camera stands still and does not look at the world's origin, where smoke is taken to stand; how far "
+                "away it is, and so how large, is a guess. Give the camera with the origin at the smoke.",
+            )
+        return fitted
     if given is not None:
         report.warning("cameras_ignored", 'A cameras.json was given, but cameras.mode is "still"; it is not used.')
     elif config.mode == "auto":

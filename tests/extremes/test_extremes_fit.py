@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from backend.contract.cameras import Cameras
+from backend.contract.job import CamerasConfig
 from backend.fit.scene import optical_depth
 from backend.io.video import MIN_FRAMES, open_clip
-from tests.extremes.small_fit import Fitted, around, extracted, fit, layer_of, puffs, still
+from backend.reporting import SilentReport
+from backend.stages import cameras as cameras_stage
+from tests.extremes.small_fit import SIZE, Fitted, around, extracted, fit, layer_of, puffs, still
 from tests.reference.refusals import told
 
 PART = "Fit"
@@ -182,6 +185,32 @@ def test_any_scale_and_place_of_a_moving_camera(table):
     table.row(
         "distance of the world's origin", tried="1.7e6 m, a camera that goes around", happens="the same smoke, there",
         measure="difference of opacities", worst=difference(here, far)[0], bound=0.02,
+    )  # fmt: skip
+
+
+def test_a_still_camera_far_from_the_origin_says_so(table):
+    """One still view tells no depth: smoke stands at the origin. Where the camera does not look there, that is a guess."""
+
+    def warned(cameras: Cameras) -> bool:
+        report = SilentReport()
+        cameras_stage.run(
+            num_frames=3,
+            size=SIZE,
+            fps=24.0,
+            config=CamerasConfig(),
+            given=cameras,
+            motion=lambda: pytest.fail("asked"),
+            report=report,
+        )
+        return "camera_misses_origin" in [code for code, _ in report.warnings]
+
+    here = around(1)
+    wrong = sum(warned(cameras) for cameras in (here, still(), still(distance=1e6), around(1, scale=1e-4)))
+    for away in ((1e6, 0.0, 0.0), (1e6, -1e6, 1e6), (0.0, 1e6, 0.0), (0.0, 0.0, 30.0)):
+        wrong += not warned(around(1, away=away))
+    table.row(
+        "a still camera that misses the world's origin", tried="30 m to 1.7e6 m off, and four that look there",
+        happens="a warning: how large the smoke is, is a guess", measure="wrong answers", worst=wrong, bound=0,
     )  # fmt: skip
 
 
