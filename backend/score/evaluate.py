@@ -4,8 +4,9 @@ trivial answers get on the same pictures, and the volumes of a prior that treats
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -65,24 +66,10 @@ def evaluate(
     places = {view: {frame: index for index, frame in enumerate(frames)} for view, frames in truth.frames.items()}
     for view in truth.frames:
         pictures = seen if view == INPUT_VIEW else truth.pictures(view)
-        report = begin(f"view {view}")
-        rounds = rounds_of(prediction, truth, view, seen, anchor)
-        num_steps = sum(len(part.frames) for part in rounds)
-        step = 0
-        for part in rounds:
-            tallies = {name: Tally(part.frames, perceptual=perceptual) for name in part.answers}
-            flow = FlowError(len(part.frames))
-            for frame in part.frames:
-                report.progress(step, num_steps)
-                step += 1
-                target = Target(pictures[places[view][frame]])
-                for name, answer in part.answers.items():
-                    tallies[name].add(frame, answer(frame), target)
-                flow.add(coded(part.answers[OURS](frame)), target)
-            found = {name: tally.summary(part.num_seen) for name, tally in tallies.items()}
+        for part in rounds_of(prediction, truth, view, seen, anchor):
+            report = begin(f"view {part.name}".replace("_", " "))
+            found, motion[part.name] = _scored(part, pictures, places[view], perceptual, report)
             (scores if part.num_seen else future)[part.name] = found
-            motion[part.name] = flow.summary()
-        report.progress(num_steps, num_steps)
     scores |= future
     scores["motion"] = motion
     scores["by_frame_angle"] = angles(truth, anchor)
@@ -92,14 +79,41 @@ def evaluate(
     return scores
 
 
+def _scored(
+    part: Round,
+    pictures: Pictures,
+    places: Mapping[int, int],  # frame -> its picture
+    perceptual: Perceptual | None,
+    report: Report,
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """Figures of every answer, and of ours the error of its optical flow."""
+    tallies = {name: Tally(part.frames, perceptual=perceptual) for name in part.answers}
+    flow = FlowError(len(part.frames))
+    for step, frame in enumerate(part.frames):
+        report.progress(step, len(part.frames))
+        target = Target(pictures[places[frame]])
+        for name, answer in part.answers.items():
+            tallies[name].add(frame, answer(frame), target)
+        flow.add(coded(part.answers[OURS](frame)), target)
+    report.progress(len(part.frames), len(part.frames))
+    return {name: tally.summary(part.num_seen) for name, tally in tallies.items()}, flow.summary()
+
+
 def rounds_of(prediction: Prediction, truth: Truth, view: str, seen: Pictures, anchor: np.ndarray) -> list[Round]:
-    """What is compared in a view: its seen frames, and those ahead where the forecast reaches them."""
+    """What is compared in a view: its seen frames, and those ahead where the forecast reaches them. Nothing is drawn yet."""
     asked = [frame for frame in truth.frames[view] if frame < prediction.num_frames]
-    shown = {frame: prediction.picture(truth.view(view, frame), frame) for frame in asked}
     past = [frame for frame in asked if frame < truth.num_seen]
     ahead = [frame for frame in asked if frame >= truth.num_seen]
-    still = np.mean([shown[frame] for frame in past], axis=0)
-    ours: dict[str, Answer] = {OURS: shown.__getitem__, "still mean": lambda frame: still}
+
+    @cache
+    def shown(frame: int) -> np.ndarray:
+        return prediction.picture(truth.view(view, frame), frame)
+
+    @cache
+    def still() -> np.ndarray:
+        return np.mean([shown(frame) for frame in past], axis=0)
+
+    ours: dict[str, Answer] = {OURS: shown, "still mean": lambda frame: still()}
     answers = ours | _trivial(truth, view, seen, anchor)
     if view == INPUT_VIEW:  # where a copy is the truth itself
         answers = {name: answers[name] for name in (OURS, "black", "grey")}

@@ -209,7 +209,12 @@ def test_an_interrupt_ends_it_cleanly(scene: Path, job: Path, perfect: Path, tmp
     blender = stand_in(tmp_path, perfect, "time.sleep(60)")
     command = [sys.executable, "-m", "backend", "evaluate", "--job", job, "--truth", scene, "--out", tmp_path / "scores.json"]
     command += ["--relight", tmp_path / "drawn", "--blender", blender, "--html", tmp_path / "report.html"]
-    with subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, env=environment(), text=True) as process:
+    command, options = list(map(str, command)), {"stderr": subprocess.PIPE, "env": environment(), "text": True}
+
+    def hears() -> None:  # what runs the tests in the background may have taught its children to ignore it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(command, preexec_fn=hears, **options) as process:
         deadline = time.monotonic() + 100.0
         while not list((tmp_path / "drawn").rglob("blender.txt")) and time.monotonic() < deadline:
             time.sleep(0.1)
