@@ -24,12 +24,16 @@ from backend.contract.decisions import DECISIONS_FILE, read_decisions
 from backend.contract.errors import BackendError
 from backend.contract.estimates import ESTIMATE_FILE, Estimate, read_estimate
 from backend.contract.job import Config, Job, read_job
+from backend.contract.light import Light
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.estimate.predict import estimate
 from backend.estimate.time_left import TimeLeft
 from backend.events_out import EventSink, StageReport, StopRequest
+from backend.fit import light
 from backend.fit.lift import buoyancy_of, wind_of
+from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
+from backend.geometry.camera import view_at
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
 from backend.io.frame_stack import FrameStack, FrameStackWriter
@@ -347,7 +351,6 @@ class Pipeline:
                 writer.append(particle_frame(record), is_forecast=True)
             last = fluid[len(fluid) - 1]
             buoyancy, doubt = buoyancy_of(last)
-            wind = wind_of(last, drag=self.config.physical.drag)
             with open_stage_file(self.folder.smoke) as file:
                 frame_start = int(file.attrs["frame_start"])  # type: ignore[arg-type]
             info = ParticlesInfo(
@@ -359,9 +362,9 @@ class Pipeline:
                 fluid={
                     "smoothing_length_m": float(last.smoothing_length),
                     "rest_density": float(last.rest_density),
-                    **{f"wind_{axis}_m_per_second": float(speed) for axis, speed in zip("xyz", wind, strict=True)},
-                    **self._drag(),
+                    **self._air(last),
                 },
+                light=self._light(seen),
                 provenance={
                     "program": f"wildsmoke {__version__}",
                     "source_fingerprint": source,
@@ -408,15 +411,33 @@ class Pipeline:
             bounds=plan.bounds,
             buoyancy=particles.info.buoyancy,
             background_plate=self.folder.plate.name if self.folder.plate.is_file() else None,
+            light=particles.info.light,
             warnings=warnings,
             fingerprint=mark,
         )
 
-    def _drag(self) -> dict[str, float]:
-        """The drag of the method's fluid, 1/s: everywhere, or where smoke borders on air."""
-        if self.config.method == "default":
-            return {"drag_per_second": self.config.physical.drag}
-        return {"surface_drag_per_second": self.config.published.surface_drag}
+    def _air(self, last: PhysicalRecord) -> dict[str, float]:
+        """What the air does in the method's fluid: drag, 1/s, everywhere or where smoke borders on air, and the learned wind."""
+        if self.config.method != "default":
+            return {"surface_drag_per_second": self.config.published.surface_drag}
+        drag = self.config.physical.drag
+        wind = wind_of(last, drag=drag)
+        return {"drag_per_second": drag} | {
+            f"wind_{axis}_m_per_second": float(speed) for axis, speed in zip("xyz", wind, strict=True)
+        }
+
+    def _light(self, seen: Series[VisualRecord]) -> Light | None:
+        """The clip's light, if its smoke shows one in a few frames of all parts of the clip."""
+        cameras = read_cameras(self.folder.cameras)
+        with open_stage_file(self.folder.smoke) as file:
+            layers = FrameStack(file, "smoke")
+            numbers = np.unique(np.linspace(len(seen) // 6, len(seen) - 1, light.NUM_FRAMES).astype(int)).tolist()
+            shots = []
+            for number in numbers:
+                layer = layers[number]
+                view = view_at(cameras, number, size=(layer.shape[1], layer.shape[0]))
+                shots.append(light.Shot(particles=particle_frame(seen[number]), view=view, layer=layer))
+        return light.find_light(shots)
 
     # -- bookkeeping ----------------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from ...backend.contract.result import Result
 
 GROUP_NAME = "Wildsmoke Smoke"
 GROUP_VERSION = 1
+FAINT_HUE = 0.3  # difference of the channels, share of the brightest
 DEFAULT_ALBEDO = 0.95  # of the brightest channel: fresh smoke scatters far more than it absorbs
 
 _INPUTS = (  # name, socket type, default, minimum, maximum, what the artist reads
@@ -51,10 +52,19 @@ def apply(smoke: bpy.types.Object, result: Result, *, name: str) -> bpy.types.Ma
     return made
 
 
-def albedo_of(smoke_color: tuple[float, float, float]) -> tuple[float, float, float, float]:
+def hue_of(result: Result) -> tuple[float, float, float]:
+    """The smoke's own hue, its brightest channel 1. Where the clip's light is known, a faint hue is the light's: smoke is grey
+    unless it says otherwise."""
+    low, brightest = min(result.smoke_color), max(result.smoke_color)
+    if not brightest > 1e-6 or (result.light is not None and brightest - low < FAINT_HUE * brightest):
+        return (1.0, 1.0, 1.0)
+    r, g, b = (max(channel, 0.0) / brightest for channel in result.smoke_color)
+    return (r, g, b)
+
+
+def albedo_of(result: Result) -> tuple[float, float, float, float]:
     """The smoke's hue, its brightest channel at DEFAULT_ALBEDO: brightness is the light's part."""
-    brightest = max(smoke_color)
-    r, g, b = (max(c, 0.0) / brightest if brightest > 1e-6 else 1.0 for c in smoke_color)
+    r, g, b = hue_of(result)
     return (DEFAULT_ALBEDO * r, DEFAULT_ALBEDO * g, DEFAULT_ALBEDO * b, 1.0)
 
 
@@ -66,7 +76,7 @@ def _connect_color(target: bpy.types.Material, result: Result) -> None:
         return  # the artist has built another material: theirs to keep
     attribute = tree.nodes.get("Color Grid")
     node.inputs["Filmed Color"].default_value = (*result.smoke_color, 1.0)
-    node.inputs["Albedo"].default_value = albedo_of(result.smoke_color)
+    node.inputs["Albedo"].default_value = albedo_of(result)
     if result.has_color and attribute is None:
         attribute = tree.nodes.new("ShaderNodeAttribute")
         attribute.name = attribute.label = "Color Grid"

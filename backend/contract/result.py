@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import BackendError
+from .light import Light, parse_light
 from .units import RESULT_FORMAT_VERSION
 
 JOB_FILE = "job.json"
@@ -29,7 +30,7 @@ class Result:
 
     num_frames: fitted; num_forecast: after them. frame_start: the clip's frame that was fitted first.
     has_color: the VDBs hold a `color` grid; else `smoke_color` (linear RGB) is the colour of all of it.
-    bounds: ((x, y, z) low, (x, y, z) high) of the smoke over all frames, m.
+    bounds: ((x, y, z) low, (x, y, z) high) of the smoke over all frames, m. light: the clip's, where its smoke shows one.
     """
 
     particles: str
@@ -45,6 +46,7 @@ class Result:
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
     buoyancy: tuple[float, float, float]
     background_plate: str | None = None
+    light: Light | None = None
     warnings: list[dict[str, str]] = field(default_factory=list)
     fingerprint: str = ""
 
@@ -66,6 +68,8 @@ def read_result(job_folder: str | os.PathLike[str]) -> Result:
             raise ValueError("another format version")
         for name in ("bounds", "smoke_color", "buoyancy"):
             data[name] = _tuples(data[name])
+        if data.get("light") is not None:
+            data["light"] = parse_light(data["light"])
         return _checked(Result(**data))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise BackendError("result_unreadable", f"{path} cannot be read: {error}.", hint="Run the job again.") from error
@@ -87,6 +91,8 @@ def _checked(result: Result) -> Result:
         value, kinds = getattr(result, item.name), _KINDS.get(str(item.type))
         if kinds is not None and (not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds)):
             raise ValueError(f"{item.name} is {type(value).__name__} where {item.type} is expected")
+    if len(result.bounds) != 2:
+        raise ValueError("the bounds are not two corners")
     numbers = (result.fps, result.voxel_size, *result.smoke_color, *result.buoyancy, *result.bounds[0], *result.bounds[1])
     counts = (result.num_frames, result.num_forecast, result.frame_start)
     if not all(math.isfinite(number) for number in numbers) or min(counts) < 0:

@@ -1,0 +1,203 @@
+"""The clip's light from the shading of its smoke: where the sun stands, how bright it is, and what else there is.
+
+Thin smoke shows L = S exp(-s d(x)) + A a(x): d is the optical depth between x and the sun, s < 1 because light scattered
+forwards goes on (similarity: s = 1 - g, van de Hulst 1980), a the mean of the same over the sky. A pixel shows the mean of L
+along its ray, each place as it is seen through what is before it. S and A are a non-negative least squares (Lawson and Hanson
+1974) for each direction of the sun that is tried; the direction that explains most stays. All of it is done on a few small
+pictures, and what counts is what it explains of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.optimize import nnls
+
+from backend.contract.light import Light
+from backend.field.shadow import depth_towards
+from backend.geometry.camera import View, resized
+from backend.geometry.lattice import Lattice
+from backend.io.particles import ParticleFrame
+from backend.render.voxelize import voxelize
+
+LEAST_EXPLAINED = 0.3  # of the colour's variation, on other frames: less is no shading
+LEAST_VARIATION = 0.05  # of the mean brightness: smoke of one brightness shows no light
+SOFTNESS = (0.35, 0.7, 1.0)
+NUM_FRAMES = 8
+_SIDE = 44  # px
+_CELLS = 26  # of the longest side
+_SAMPLES = 40  # along a ray
+_OPAQUE = 0.15  # pixels that show less smoke are not looked at
+_DIRECTIONS = 120  # all around; then closer ones
+_NEAR = (14.0, 6.0)  # degrees from the best so far
+_AS_GOOD = 0.05  # of what is explained: directions that explain so much less are not worse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """A frame: its particles, its camera and its smoke layer [H, W, 4], linear premultiplied RGB and opacity."""
+
+    particles: ParticleFrame
+    view: View
+    layer: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rays:
+    """Of one shot. colors [P, 3]; places [3, P, S] voxels of the lattice; weights [P, S], one in sum along each ray."""
+
+    density: np.ndarray
+    lattice: Lattice
+    colors: np.ndarray
+    places: np.ndarray
+    weights: np.ndarray
+
+    def shown(self, light: np.ndarray) -> np.ndarray:
+        """[P]: what the rays show of a light [X, Y, Z] on the lattice."""
+        return (self.weights * ndimage.map_coordinates(light, self.places, order=1, mode="nearest")).sum(axis=1)
+
+
+def find_light(shots: Sequence[Shot]) -> Light | None:
+    """The light that explains the shading; None where the smoke shows none. Every other shot is for the proof."""
+    rays = [found for shot in shots if (found := _rays(shot)) is not None]
+    if len(rays) < 2:
+        return None
+    taught, proof, whole = _Search(rays[::2]), _Search(rays[1::2]), _Search(rays)
+    if not whole.brightness.std() > LEAST_VARIATION * whole.brightness.mean():
+        return None
+    tried = evenly(_DIRECTIONS)
+    errors = np.array([taught.error(way, SOFTNESS[1]) for way in tried])
+    direction = tried[int(np.argmin(errors))]
+    softness = SOFTNESS[int(np.argmin([taught.error(direction, one) for one in SOFTNESS]))]
+    for degrees in _NEAR:
+        direction = taught.closer(direction, degrees, softness)
+    weights, least = _solved(taught.columns(direction, softness), taught.brightness)
+    missed = np.square(proof.brightness - proof.columns(direction, softness) @ weights).sum()
+    explained = 1.0 - float(missed / np.square(proof.brightness - taught.brightness.mean()).sum())
+    if not explained >= LEAST_EXPLAINED:
+        return None
+    parts = np.array([_solved(whole.columns(direction, softness), whole.colors[:, channel])[0] for channel in range(3)])
+    variation = float(np.square(taught.brightness - taught.brightness.mean()).sum())
+    as_good = np.vstack([direction, tried[errors <= least + _AS_GOOD * (variation - least)]])
+    angles = np.degrees(np.arccos(np.clip(as_good @ direction, -1.0, 1.0)))
+    return Light(
+        direction=_triple(direction),
+        sun=_triple(parts[:, 0]),
+        ambient=_triple(parts[:, 1]),
+        softness=softness,
+        explained=explained,
+        doubt_degrees=float(np.sqrt(np.square(angles).mean())),
+    )
+
+
+class _Search:
+    """Directions of the sun against the brightness [P] of all rays together."""
+
+    def __init__(self, rays: list[_Rays]) -> None:
+        self.rays = rays
+        self.colors = np.concatenate([item.colors for item in rays])
+        self.brightness = self.colors.mean(axis=1)
+        self._sky = {softness: self._shown(lambda item, s=softness: _sky_light(item, s)) for softness in SOFTNESS}
+
+    def closer(self, direction: np.ndarray, degrees: float, softness: float) -> np.ndarray:
+        """The best of a direction and of six around it."""
+        side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+        side /= np.linalg.norm(side)
+        other, tilt = np.cross(direction, side), np.radians(degrees)
+        around = np.radians(60.0 * np.arange(6))[:, None]
+        ring = np.cos(tilt) * direction + np.sin(tilt) * (np.cos(around) * side + np.sin(around) * other)
+        tried = np.vstack([direction, ring])
+        return tried[int(np.argmin([self.error(way, softness) for way in tried]))]
+
+    def error(self, direction: np.ndarray, softness: float) -> float:
+        return _solved(self.columns(direction, softness), self.brightness)[1]
+
+    def columns(self, direction: np.ndarray, softness: float) -> np.ndarray:
+        """[P, 2]: what the rays show of a sun and of a sky of brightness one."""
+        sun = self._shown(lambda item: np.exp(-softness * depth_towards(item.density, item.lattice, direction)))
+        return np.stack([sun, self._sky[softness]], axis=1)
+
+    def _shown(self, light: Callable[[_Rays], np.ndarray]) -> np.ndarray:
+        return np.concatenate([item.shown(light(item)) for item in self.rays])
+
+
+def evenly(count: int) -> np.ndarray:
+    """[count, 3] unit vectors all around, as even as a spiral gets (Fibonacci lattice)."""
+    index = np.arange(count) + 0.5
+    height, angle = 1.0 - 2.0 * index / count, np.pi * (1.0 + 5.0**0.5) * index
+    radius = np.sqrt(1.0 - height * height)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+
+
+def _sky_light(item: _Rays, softness: float) -> np.ndarray:
+    """[X, Y, Z]: share of an even sky that reaches each voxel."""
+    sky = evenly(26)
+    return np.mean([np.exp(-softness * depth_towards(item.density, item.lattice, way)) for way in sky[sky[:, 2] > 0]], axis=0)
+
+
+def _solved(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights of the columns, none negative, and the squared error."""
+    weights, size = nnls(columns, wanted)
+    return weights, float(size) ** 2
+
+
+def _rays(shot: Shot) -> _Rays | None:
+    """What a shot's pixels see, at a small size; None where it shows next to no smoke."""
+    if shot.particles.count < 8:
+        return None
+    height, width = shot.layer.shape[:2]
+    share = min(1.0, _SIDE / max(height, width))
+    size = max(1, round(width * share)), max(1, round(height * share))
+    small = cv2.resize(shot.layer, size, interpolation=cv2.INTER_AREA)
+    view = resized(shot.view, size)
+    rows, columns = np.nonzero(small[..., 3] > _OPAQUE)
+    lattice = _lattice(shot.particles)
+    if len(rows) < 8 or lattice is None:
+        return None
+    density = np.ascontiguousarray(voxelize(shot.particles, lattice)["density"], np.float32)
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    first, last = lattice.origin, np.array(lattice.origin) + lattice.voxel_size * (np.array(lattice.shape) - 1)
+    middle = float(view.to_camera(0.5 * (first + last)[None])[0, 2])
+    reach = 0.5 * float(np.linalg.norm(last - first)) + lattice.voxel_size
+    near = max(middle - reach, 1e-3 * reach)
+    depths = near + (middle + reach - near) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    points = view.unproject(np.repeat(pixels, _SAMPLES, axis=0), np.tile(depths, len(pixels)))
+    places = np.moveaxis((points - first) / lattice.voxel_size, -1, 0).reshape(3, len(pixels), _SAMPLES)
+    slant = np.linalg.norm(
+        points.reshape(len(pixels), _SAMPLES, 3)[:, 1] - points.reshape(len(pixels), _SAMPLES, 3)[:, 0], axis=1
+    )
+    tau = ndimage.map_coordinates(density, places, order=1, mode="constant") * slant[:, None]
+    weights = np.exp(-(np.cumsum(tau, axis=1) - tau)) * -np.expm1(-tau)
+    total = weights.sum(axis=1)
+    is_met = total > 0.5 * _OPAQUE
+    seen = small[rows, columns]
+    if is_met.sum() < 8:
+        return None
+    return _Rays(
+        density=density,
+        lattice=lattice,
+        colors=(seen[:, :3] / seen[:, 3:])[is_met].astype(np.float64),
+        places=places[:, is_met],
+        weights=weights[is_met] / total[is_met, None],
+    )
+
+
+def _lattice(particles: ParticleFrame) -> Lattice | None:
+    """Around nearly all particles, for the few that are far off would make the cells large."""
+    low, high = (np.percentile(particles.positions, share, axis=0) for share in (1.0, 99.0))
+    margin = 2.0 * float(np.median(particles.scales))
+    low, high = low - margin, high + margin
+    size = float((high - low).max()) / _CELLS
+    if not size > 0.0 or not np.isfinite(size):
+        return None
+    shape = tuple(int(count) for count in np.maximum(np.ceil((high - low) / size), 2))
+    return Lattice(origin=_triple(low + 0.5 * size), voxel_size=size, shape=shape)  # type: ignore[arg-type]
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
