@@ -36,12 +36,33 @@ class Divergence:
     coverage: float
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, inline="always")
+def _exp(x):
+    """exp of -2..0 to 1e-15: eleven terms of its series at an eighth of x, then squared three times. math.exp costs more than
+    all else in the loop."""
+    t = 0.125 * x
+    p = 1.0 + t * (1.0 / 11.0)
+    p = 1.0 + t * (1.0 / 10.0) * p
+    p = 1.0 + t * (1.0 / 9.0) * p
+    p = 1.0 + t * (1.0 / 8.0) * p
+    p = 1.0 + t * (1.0 / 7.0) * p
+    p = 1.0 + t * (1.0 / 6.0) * p
+    p = 1.0 + t * (1.0 / 5.0) * p
+    p = 1.0 + t * (1.0 / 4.0) * p
+    p = 1.0 + t * (1.0 / 3.0) * p
+    p = 1.0 + t * (1.0 / 2.0) * p
+    p = 1.0 + t * p
+    p *= p
+    p *= p
+    return p * p
+
+
+@njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _normal_equations(positions, velocities, starts, indices, sigma, normal, moment):
     """Writes normal [N, 3, 3] = A^T W A and moment [N, 3, 3] = A^T W B."""
     scale = -1.0 / (2.0 * sigma * sigma)
     for i in prange(positions.shape[0]):
-        # Sums in variables of their own stay in registers, which arrays do not.
+        # Sums in variables of their own stay in registers; in arrays they do not.
         xx = xy = xz = yy = yz = zz = 0.0
         xu = xv = xw = yu = yv = yw = zu = zv = zw = 0.0
         for k in range(starts[i], starts[i + 1]):
@@ -52,7 +73,7 @@ def _normal_equations(positions, velocities, starts, indices, sigma, normal, mom
             u = velocities[j, 0] - velocities[i, 0]
             v = velocities[j, 1] - velocities[i, 1]
             w = velocities[j, 2] - velocities[i, 2]
-            weight = math.exp(scale * (x * x + y * y + z * z))
+            weight = _exp(scale * (x * x + y * y + z * z))
             wx, wy, wz = weight * x, weight * y, weight * z
             xx, xy, xz, yy, yz, zz = xx + wx * x, xy + wx * y, xz + wx * z, yy + wy * y, yz + wy * z, zz + wz * z
             xu, xv, xw = xu + wx * u, xv + wx * v, xw + wx * w

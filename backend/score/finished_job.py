@@ -23,7 +23,7 @@ from backend.io.particles import Particles, read_particles
 from backend.io.records import RecordFile, open_stage_file
 from backend.reporting import SilentReport
 from backend.score.evaluate import Reports, evaluate
-from backend.score.particles import ParticlePrediction, learned_buoyancy, mean_divergence
+from backend.score.particles import ParticlePrediction, learned_buoyancy, learned_light, mean_divergence
 from backend.score.perceptual import Perceptual
 from backend.score.proposals import Proposals
 from backend.score.truth_set import Truth
@@ -91,6 +91,7 @@ def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, 
     scores = evaluate(job.prediction, truth, anchor=job.anchor, prior=job.proposals, perceptual=perceptual, begin=begin)
     scores["divergence"] = mean_divergence(job.particles, report=begin("divergence"))
     scores["buoyancy"] = learned_buoyancy(job.particles)
+    scores["light"] = learned_light(job.particles)
     missing = {}
     if perceptual is None:
         missing["lpips"] = "no weights; --lpips FILE reads them"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from backend.geometry.camera import View
@@ -62,3 +64,15 @@ def learned_buoyancy(particles: Particles) -> dict[str, float]:
     if strength > 0.0:
         found["degrees_from_up"] = round(float(np.degrees(np.arccos(np.clip(vector[2] / strength, -1.0, 1.0)))), 2)
     return found
+
+
+def learned_light(particles: Particles) -> dict[str, Any]:
+    """Where the sun stands, by what the smoke shows, and how sure that is; nothing where it shows none."""
+    light = particles.info.light
+    if light is None:
+        return {}
+    return {
+        "direction": [round(part, 4) for part in light.direction],
+        "explained": round(light.explained, 4),
+        "doubt_degrees": round(light.doubt_degrees, 2),
+    }

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from backend.physics.divergence import MIN_NEIGHBOURS, divergence, divergence_as_published
+from backend.physics.divergence import MIN_NEIGHBOURS, both_divergences, divergence, divergence_as_published
 from tests.reference import fluid_loops
 
 FIELD = np.array([[0.5, 2.0, -1.0], [0.3, -0.2, 0.7], [-0.4, 0.6, 1.1]])  # 1/s, trace 1.4
@@ -39,6 +39,17 @@ def test_published_form_against_slow_loops():
     np.testing.assert_allclose(found.values, expected, rtol=1e-9, atol=1e-12)
     assert found.mean_absolute == pytest.approx(np.abs(expected).mean(), rel=1e-9)
     assert found.coverage == 1.0
+
+
+def test_both_at_once_are_each_alone():
+    positions = np.concatenate([cloud(120), [[9.0, 0.0, 0.0]]])
+    velocities = np.random.default_rng(2).normal(size=positions.shape)
+    published, corrected = both_divergences(positions, velocities, 0.4)
+    alone = divergence_as_published(positions, velocities, 0.4), divergence(positions, velocities, 0.4)
+    for together, apart in zip((published, corrected), alone, strict=True):
+        np.testing.assert_array_equal(together.values, apart.values)
+        assert (together.mean_absolute, together.coverage) == (apart.mean_absolute, apart.coverage)
+    assert published.coverage == 1.0 > corrected.coverage
 
 
 def test_sparse_sets_look_better_only_as_published():

@@ -19,12 +19,11 @@ h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .3rem; }
 h2 { font-size: 1.3rem; margin: 2.6rem 0 .6rem; padding-top: .8rem; border-top: 1px solid var(--rule); }
 h3 { font-size: 1.05rem; margin: 1.6rem 0 .4rem; }
 p { max-width: 46rem; margin: .4rem 0 .8rem; }
-.soft, figcaption, caption { color: var(--soft); font-size: .875rem; }
+.soft, figcaption { color: var(--soft); font-size: .875rem; }
 nav ul { display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; padding: 0; list-style: none; margin: .8rem 0; }
 a { color: var(--c0); }
-.scroll { overflow-x: auto; margin: .6rem 0 1.2rem; }
+.scroll { overflow-x: auto; margin: .3rem 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
-caption { text-align: left; padding-bottom: .4rem; caption-side: top; max-width: 60rem; }
 th, td { padding: .28rem .55rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
 th:first-child, td:first-child, th.text, td:has(.text) { text-align: left; }
 thead th { vertical-align: bottom; color: var(--soft); font-weight: 600; white-space: normal; max-width: 8.5rem; }
@@ -83,9 +82,10 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]], *, caption: st
         kind = ' class="ours"' if ours and row[0] == ours else ""
         cells = "".join(f"<td>{cell}</td>" for cell in row[1:])
         body.append(f'<tr{kind}><th scope="row">{row[0]}</th>{cells}</tr>')
+    label = escape(caption, quote=True)
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption, quote=True)}"><table>'
-        f"<caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+        f'<figure><figcaption>{escape(caption)}</figcaption><div class="scroll" tabindex="0" role="region" aria-label="{label}">'
+        f'<table aria-label="{label}"><thead><tr>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div></figure>'
     )
 
 

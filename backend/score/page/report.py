@@ -117,6 +117,8 @@ def _motion(scores: Mapping[str, Any]) -> str:
         ["particles that the corrected one counts, %", markup.number(100.0 * found.get("coverage", 0.0), 1)],
         ["learned buoyancy, m/s&sup2;", markup.number(scores["buoyancy"].get("strength"), 3)],
         ["its direction off upwards, degrees", markup.number(scores["buoyancy"].get("degrees_from_up"), 1)],
+        ["shading that the found sun explains, share", markup.number(scores["light"].get("explained"), 2)],
+        ["doubt of the sun's direction, degrees", markup.number(scores["light"].get("doubt_degrees"), 0)],
     ]
     return flow + markup.table(["figure", "value"], rows, caption="Particles, means over the fitted frames")
 
