@@ -162,6 +162,15 @@ def check_backend() -> bool:
     return True
 
 
+def look_at_clip() -> bool:
+    if session().current.look is None:
+        if session().current.clip_look is None:
+            pressed("inspect_clip")
+        return False
+    REPORT["estimates"] = [item.to_text() for item in session().current.look.outlook.estimates]
+    return True
+
+
 def open_all_panels() -> bool:
     """Register the panels again, open: a click on each heading would do the same."""
     panel = sys.modules[f"{MODULE}.addon.panel"]

@@ -98,6 +98,14 @@ def test_every_end_is_shown(gui, blend, plan, behaviour):
     assert report["phases"][-1] == {"error": "failed", "half_line": "crashed", "succeed": "done"}[behaviour]
 
 
+def test_what_to_expect_is_shown_before_start(gui, blend, plan):
+    plan["video"] = plan["video"].replace("slow", "succeed")
+    steps = ["open_sidebar", "use_fake_backend", "fill_in", "measure_ticks", "look_at_clip", "shot outlook", "hold"]
+    gui.start(blend, **plan, steps=steps)
+    report = gui.wait_for("holding", seconds=120)
+    assert len(report["estimates"]) == 3 and report["tick_seconds"] < 0.1
+
+
 def test_all_panels_open(gui, blend, plan):
     gui.start(blend, **plan, steps=["open_all_panels", "open_sidebar", "fill_in", "shot panels", "hold"])
     gui.wait_for("holding", seconds=60)
