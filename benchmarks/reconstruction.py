@@ -16,12 +16,13 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -36,6 +37,7 @@ from backend.io.atomic import write_text
 from backend.prior.weights import weights_fingerprint
 from backend.score.compare import best_trivial
 from benchmarks.cost import CHECKOUT, run_backend
+from synthetic.scenes import towards_sun
 
 DOCS = CHECKOUT / "docs"
 SETS = CHECKOUT / "synthetic" / "bench"
@@ -145,7 +147,18 @@ def scores_of(cell: Cell) -> dict[str, Any]:
     run_module("backend", "evaluate", "--job", cell.job, "--truth", cell.scene, "--out", part)
     scores = json.loads(part.read_text(encoding="utf-8"))
     part.unlink()
+    if scores["light"]:
+        scores["light"]["degrees_from_sun"] = degrees_between(scores["light"]["direction"], towards_sun())
     return scores
+
+
+def degrees_between(a: Sequence[float], b: Sequence[float]) -> float | None:
+    """None where one has no direction."""
+    size = math.hypot(*a) * math.hypot(*b)
+    if not size > 0.0:
+        return None
+    cosine = sum(x * y for x, y in zip(a, b, strict=True)) / size
+    return round(math.degrees(math.acos(min(max(cosine, -1.0), 1.0))), 2)
 
 
 def gather(root: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from backend.contract.result import CAMERAS_FILE, RESULT_FILE, read_result
 from backend.contract.truth import INPUT_FOLDER, SMOKE_VIDEO
 from backend.io.atomic import write_text
 from benchmarks.cost import run_backend
-from benchmarks.reconstruction import SETS, UNTOUCHED
+from benchmarks.reconstruction import SETS, UNTOUCHED, degrees_between
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         found = np.array(read_result(job).buoyancy)
         row = {"scene": name, "untouched": name in UNTOUCHED, "preset": given.preset, "tilt_degrees": given.degrees}
         row |= {"strength": round(float(np.linalg.norm(found)), 4)}
-        row |= {"degrees_from_up": degrees_between(found, turn(given.degrees)[:3, 2])}
+        row |= {"degrees_from_up": degrees_between(found.tolist(), turn(given.degrees)[:3, 2].tolist())}
         rows.append(row)
         print(json.dumps(row), flush=True)
     if given.json:
@@ -65,12 +65,6 @@ def tilted(cameras: Cameras, degrees: float) -> Cameras:
     """The same cameras in a world that was turned with everything in it."""
     matrices = turn(degrees) @ np.array(cameras.camera_to_world)
     return replace(cameras, camera_to_world=tuple(tuple(map(tuple, matrix.tolist())) for matrix in matrices))
-
-
-def degrees_between(a: np.ndarray, b: np.ndarray) -> float | None:
-    """None where one has no direction."""
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return round(float(np.degrees(np.arccos(np.clip(a @ b / size, -1.0, 1.0)))), 2) if size > 0.0 else None
 
 
 if __name__ == "__main__":

@@ -5,10 +5,19 @@ World: z up, the ground at z = 0, the (first) source near the z axis.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+SUN_AZIMUTH = 190.0  # degrees; from the left for the training sweep, then from behind: shaded sides, lit edges
+SUN_ELEVATION = 30.0  # degrees: low enough to model the smoke and to throw its shadow into view
 GRAVITY = 9.81  # m/s^2
 AIR_TEMPERATURE = 293.0  # K
+
+
+def towards_sun() -> tuple[float, float, float]:
+    """Unit vector; the sun of all scenes."""
+    azimuth, elevation = math.radians(SUN_AZIMUTH), math.radians(SUN_ELEVATION)
+    return math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

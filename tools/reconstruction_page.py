@@ -79,6 +79,7 @@ VOLUME_COLUMNS: dict[str, tuple[Figure, str]] = {
     "div as published": (of_divergence("as_published"), ".2f"),
     "div corrected": (of_divergence("corrected"), ".2f"),
     "buoyancy off up, degrees": (lambda cell: cell["scores"]["buoyancy"].get("degrees_from_up"), ".0f"),
+    "sun off, degrees": (lambda cell: cell["scores"].get("light", {}).get("degrees_from_sun"), ".0f"),
     "seconds": (of_cost("seconds"), ".0f"),
     "processor s": (of_cost("cpu_seconds"), ".0f"),
     "peak GiB": (of_cost("peak_gib"), ".2f"),

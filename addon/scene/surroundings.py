@@ -17,7 +17,8 @@ Color = tuple[float, float, float]
 VOLUME_BOUNCES = 4  # fewer make lit smoke dark
 
 # Light that makes a plume of albedo 0.95, lit (Relight 1), about as bright as it was filmed; found by rendering one.
-_SUN_PER_RADIANCE = 9.0  # W/m^2
+_SUN_PER_RADIANCE = 9.0  # W/m^2, of what was filmed
+_FOUND_SUN_PER_RADIANCE = 10.0  # W/m^2, of what thin smoke shows in full sun
 _AMBIENT_PER_RADIANCE = 0.7
 _USUAL_SUN = (-0.49, -0.41, 0.77)  # where the clip shows none: over the left shoulder of a camera that looks along +y
 
@@ -52,7 +53,7 @@ def _light_of(result: Result) -> tuple[Color, float, Color]:
     sun = [channel / share for channel, share in zip(result.light.sun, hue, strict=True)]
     r, g, b = (_AMBIENT_PER_RADIANCE * channel / share for channel, share in zip(result.light.ambient, hue, strict=True))
     strength = max(*sun, 1e-6)
-    return (sun[0] / strength, sun[1] / strength, sun[2] / strength), _SUN_PER_RADIANCE * strength, (r, g, b)
+    return (sun[0] / strength, sun[1] / strength, sun[2] / strength), _FOUND_SUN_PER_RADIANCE * strength, (r, g, b)
 
 
 def ensure_world(scene: bpy.types.Scene, *, ambient: Color = (0.0, 0.0, 0.0)) -> None:

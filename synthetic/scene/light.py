@@ -6,8 +6,8 @@ import math
 
 import bpy
 
-SUN_AZIMUTH = 190.0  # degrees; from the left for the training sweep, then from behind: shaded sides, lit edges
-SUN_ELEVATION = 30.0  # degrees: low enough to model the smoke and to throw its shadow into view
+from ..scenes import SUN_AZIMUTH, SUN_ELEVATION
+
 _SUN_STRENGTH = 7.0  # W/m^2
 _SUN_SIZE = 1.0  # degrees
 _SKY_STRENGTH = 0.35

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from backend.contract.light import Light
 from backend.fit.state import VolumeRecord
 from backend.io.particles import ParticleFrame
-from backend.score.particles import learned_buoyancy, mean_divergence
+from backend.score.particles import learned_buoyancy, learned_light, mean_divergence
 from backend.score.proposals import Proposals
 from backend.score.truth_set import Volume
 
@@ -88,3 +89,13 @@ def test_the_direction_of_buoyancy() -> None:
     assert learned_buoyancy(particles(buoyancy=(3.0, 0.0, 3.0)))["degrees_from_up"] == pytest.approx(45.0)  # type: ignore[arg-type]
     assert learned_buoyancy(particles(buoyancy=(0.0, 0.0, -1.0)))["degrees_from_up"] == 180.0  # type: ignore[arg-type]
     assert learned_buoyancy(particles()) == {"strength": 0.0}  # type: ignore[arg-type]
+
+
+def test_the_light_that_is_told() -> None:
+    """Nothing where the smoke showed none."""
+    light = Light(
+        direction=(0.6, 0.0, 0.8), sun=(1.0, 0.9, 0.8), ambient=(0.0, 0.1, 0.2), softness=0.7, explained=0.75, doubt_degrees=9.0
+    )
+    told = learned_light(SimpleNamespace(info=SimpleNamespace(light=light)))  # type: ignore[arg-type]
+    assert told == {"direction": [0.6, 0.0, 0.8], "explained": 0.75, "doubt_degrees": 9.0}
+    assert learned_light(SimpleNamespace(info=SimpleNamespace(light=None))) == {}  # type: ignore[arg-type]

@@ -293,3 +293,26 @@ def check_what_is_missing_or_damaged_is_said(folder: Path) -> None:
     assert error_code(import_result, job, scene=scene) == "cameras_invalid"
     assert len(bpy.data.objects) == len(bpy.data.volumes) == len(bpy.data.collections) == 0  # nothing half made
     assert error_code(preview.render_layer, scene, frame=1) == "no_camera"
+
+
+def check_the_sun_stands_where_the_clip_s_did(folder: Path) -> None:
+    """A sun shines along its -z. The light keeps the hue of faintly coloured smoke; strongly coloured smoke keeps its own."""
+    towards, sun_light, sky = (-0.6, 0.48, 0.64), (0.6, 0.54, 0.48), (0.1, 0.12, 0.15)
+    light = {"direction": towards, "sun": sun_light, "ambient": sky, "softness": 0.7, "explained": 0.8, "doubt_degrees": 9.0}
+    for name, color, hue in (("grey", (0.4, 0.36, 0.32), (1.0, 1.0, 1.0)), ("orange", (0.8, 0.4, 0.2), (1.0, 0.5, 0.25))):
+        job = Path(shutil.copytree(JOB, folder / name))
+        change_result(job, light=light, smoke_color=color)
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        scene = bpy.context.scene
+        smoke = import_result(job, scene=scene)
+        sun = find_object(job, "sun")
+        assert sun is not None
+        bpy.context.view_layer.update()
+        assert np.allclose((sun.matrix_world.to_3x3() @ Vector((0.0, 0.0, 1.0))), towards, atol=1e-5), name
+        wanted = np.array(sun_light) / hue
+        assert np.allclose(sun.data.color, wanted / wanted.max(), atol=1e-5), name
+        assert np.isclose(sun.data.energy, 10.0 * wanted.max(), rtol=1e-5), name
+        world = scene.world.node_tree.nodes["Background"].inputs["Color"].default_value
+        assert np.allclose(world[:3], 0.7 * np.array(sky) / hue, atol=1e-5), name
+        albedo = smoke_node(smoke).inputs["Albedo"].default_value
+        assert np.allclose(np.array(albedo[:3]) / max(albedo[:3]), hue, atol=1e-5), name
