@@ -67,8 +67,8 @@ def quality_text(quality: tuple[Quality, ...]) -> str:
 def spoken(low: float, high: float) -> str:
     """A span of seconds as a person says it: "40 to 90 s", "2 to 4 min"."""
     if round(low) == round(high) or high < 1.0:
-        return f"{max(1, round(high))} s" if high < 90.0 else f"{high / 60.0:.0f} min"
-    if high < 90.0:
+        return f"{max(1, round(high))} s" if high <= 90.0 else f"{high / 60.0:.0f} min"
+    if high <= 90.0:
         return f"{max(1, round(low))} to {round(high)} s"
     if high < 5400.0:
         return f"{_minutes(low)} to {_minutes(high)} min"
