@@ -52,7 +52,8 @@ VIEWS = (INPUT_VIEW, "nvs", "side")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """decision: that it is about; question: what is asked; changes: settings; on: those of the job that it is compared with.
+    """decision: that it is about; question: what is asked; changes: settings; on: those of the job that it is compared with;
+    frames: of both, where they are others than all have.
 
     is_made: `inspect` makes this decision; else it was tried and found not to be worth making.
     """
@@ -62,18 +63,25 @@ class Variant:
     question: str
     changes: dict[str, str]
     on: dict[str, str] = field(default_factory=dict)
+    frames: tuple[int, int] | None = None
     is_made: bool = True
 
     @property
     def base(self) -> str:
-        return "decided" if not self.on else "decided, " + ", ".join(f"{key}={value}" for key, value in self.on.items())
+        frames = [] if self.frames is None else [f"frames {self.frames[0]} to {self.frames[1] - 1}"]
+        return ", ".join(["decided", *frames, *(f"{key}={value}" for key, value in self.on.items())])
 
 
-SMALL = {"frames.working_size": "80", "visual.num_particles": "4000"}
+SMALL = {"frames.working_size": "80", "visual.num_particles": "24000"}  # some twenty particles a pixel of smoke
 VARIANTS = (
     Variant(name="matte", decision="extraction", question="smoke on black is matted", changes={"extraction.mode": "matte"}),
     Variant(name="still", decision="camera", question="a moving camera is left out", changes={"cameras.mode": "still"}),
-    Variant(name="silhouette", decision="depth", question="the prior is left out", changes={"volume.use_prior": "false"}),
+    Variant(
+        name="silhouette",
+        decision="depth",
+        question="the prior is left out, six degrees around",
+        changes={"volume.use_prior": "false"},
+    ),
     Variant(name="half size", decision="resolution", question="half the size", changes={"frames.working_size": "128"}),
     Variant(name="one hue", decision="color", question="one channel for three", changes={"visual.color": "one_hue"}),
     Variant(name="half of them", decision="particles", question="half as many", changes={"visual.num_particles": "2000"}),
@@ -92,10 +100,24 @@ VARIANTS = (
         is_made=False,
     ),
     Variant(
+        name="silhouette, further around",
+        decision="depth",
+        question="the prior is left out, twice as far around",
+        changes={"volume.use_prior": "false"},
+        frames=(52, 82),
+    ),
+    Variant(
+        name="silhouette, half of it",
+        decision="depth",
+        question="the prior is left out, four times as far around",
+        changes={"volume.use_prior": "false"},
+        frames=(40, 100),
+    ),
+    Variant(
         name="few pixels",
         decision="particles",
-        question="6 a pixel where the settings ask for many more",
-        changes={"visual.num_particles": "1500"},
+        question="6 a pixel where the settings ask for 24",
+        changes={"visual.num_particles": "6000"},
         on=SMALL,
     ),
 )
@@ -127,6 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--from", dest="source", type=Path, default=SETS)
     parser.add_argument("--scenes", type=lambda text: text.split(","), help="all without it")
+    parser.add_argument("--variants", type=lambda text: text.split(";"), metavar="A;B", help="all without it")
     parser.add_argument("--frames", type=lambda text: tuple(map(int, text.split(":"))), default=FRAMES, metavar="A:B")
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--json", type=Path)
@@ -142,7 +165,8 @@ def main(arguments: list[str] | None = None) -> int:
     scenes = given.scenes or sorted(path.parents[1].name for path in given.source.glob(f"*/{TRUTH_FOLDER}/{TRUTH_FILE}"))
     for scene in scenes:
         folder = (given.source / scene).resolve()
-        failures += not complete(list(cells_of(root, folder, preset=given.preset, frames=given.frames)))
+        cells = cells_of(root, folder, preset=given.preset, frames=given.frames, names=given.variants)
+        failures += not complete(list(cells))
     results = gather(root, scenes, preset=given.preset, frames=given.frames)
     text = as_text(results)
     write_text(root / "results.json", text)
@@ -154,15 +178,18 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if failures else 0
 
 
-def cells_of(root: Path, scene: Path, *, preset: str, frames: tuple[int, int]) -> Iterator[Cell]:
-    """Of a scene, each after the one that it is compared with."""
-    common: dict[str, Any] = {"root": root, "scene": scene, "preset": preset, "frames": frames}
+def cells_of(root: Path, scene: Path, *, preset: str, frames: tuple[int, int], names: list[str] | None = None) -> Iterator[Cell]:
+    """Of a scene, each after the one that it is compared with. names: of the variants, None for all."""
+    common: dict[str, Any] = {"root": root, "scene": scene, "preset": preset}
     told: set[str] = set()
     for variant in VARIANTS:
+        if names is not None and variant.name not in names:
+            continue
         if variant.base not in told:
             told.add(variant.base)
-            yield Cell(**common, name=variant.base, changes=dict(variant.on), base=None)
-        yield Cell(**common, name=variant.name, changes=variant.on | variant.changes, base=variant.base)
+            yield Cell(**common, frames=variant.frames or frames, name=variant.base, changes=dict(variant.on), base=None)
+        changes = variant.on | variant.changes
+        yield Cell(**common, frames=variant.frames or frames, name=variant.name, changes=changes, base=variant.base)
 
 
 def complete(cells: list[Cell]) -> bool:
@@ -187,9 +214,11 @@ def run_cells(orders: list[dict[str, Any]]) -> None:
     """The cells of a scene that are missing, each after the one that it shares stages with."""
     cells = [Cell(**{**order, "root": Path(order["root"]), "scene": Path(order["scene"])}) for order in orders]
     bases = {cell.name: cell for cell in cells if cell.base is None}
+    asked_for = {cell.base for cell in cells if not cell.record.exists()}
     for cell in cells:
         base = None if cell.base is None else bases[cell.base]
-        if cell.record.exists() and (cell.base is not None or cell.job.is_dir()):
+        is_whole = cell.record.exists() and (cell.job.is_dir() or cell.name not in asked_for)
+        if is_whole:
             continue
         shutil.rmtree(cell.job, ignore_errors=True)
         cell.job.parent.mkdir(parents=True, exist_ok=True)
@@ -201,8 +230,6 @@ def run_cells(orders: list[dict[str, Any]]) -> None:
         print(cell.record.read_text(encoding="utf-8"), flush=True)
         if base is not None:
             shutil.rmtree(cell.job)
-    for base in bases.values():
-        shutil.rmtree(base.job)
 
 
 def run_cell(cell: Cell, donor: dict[str, Any]) -> dict[str, Any]:

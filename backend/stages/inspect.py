@@ -20,7 +20,7 @@ from backend.io.video import Clip
 from backend.reporting import Report
 
 LEAST_ONE_HUE_DB = 64.0  # of pictures brought to one hue: 16 dB beyond what the finest fit reaches costs it 0.1 dB
-LEAST_DETAIL_DB = 58.0  # of pictures reduced and brought back
+LEAST_DETAIL_DB = 64.0  # of pictures reduced and brought back, likewise
 PARTICLES_A_PIXEL = 6.0  # of the frame with most smoke; up to here more particles show more
 FEWEST_PARTICLES = 64
 KEYS = (  # with which the user decides instead

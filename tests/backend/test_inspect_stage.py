@@ -136,7 +136,7 @@ def test_only_the_frames_that_are_fitted_are_looked_at(tmp_path) -> None:
         ({"turn": 0.99 * LEAST}, "depth", "silhouette", {"volume.use_prior": False}),
         ({"one_hue_error": 10**-6.5}, "color", "one_hue", {"visual.color": "one_hue"}),
         ({"one_hue_error": 10**-6.3}, "color", "full", {"visual.color": "full"}),
-        ({"detail_errors": {0.35: 1e-3, 0.5: 1e-6}}, "resolution", "160 x 90", {"frames.working_size": 160}),
+        ({"detail_errors": {0.35: 1e-3, 0.5: 1e-7}}, "resolution", "160 x 90", {"frames.working_size": 160}),
         ({"detail_errors": {0.35: 1e-3, 0.5: 1e-4}}, "resolution", "320 x 180", {}),
         ({"source_size": (300, 200)}, "resolution", "300 x 200", {}),
         ({"mode": "matte"}, "extraction", "matte", {"extraction.mode": "matte"}),
