@@ -78,6 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
         scenes = [scene_folder(given.source, name) for name in given.scenes]
         pairs = [(scene, trial) for trial in near for scene in scenes] + [(scene, trial) for scene in scenes for trial in around]
         failures = measure([Cell(root=root, scene=scene, trial=trial) for scene, trial in dict.fromkeys(pairs)])
+        compare_trivial(root, scenes, given.frames)
         results = gather(root, swept)
     except BackendError as error:
         print(f"wildsmoke: {error}", file=sys.stderr)
@@ -144,8 +145,8 @@ def measure(cells: Sequence[Cell]) -> int:
 
 
 def is_made(cell: Cell) -> bool:
-    """Whether its record is there. Raises BackendError where it was made by other sources or weights: ratios between them
-    would be of nothing."""
+    """Whether its record is there. Raises BackendError where it was made by other sources or weights or of other frames: ratios
+    between them would be of nothing."""
     if not cell.record.exists():
         return False
     found = json.loads(cell.record.read_text(encoding="utf-8"))
@@ -153,6 +154,8 @@ def is_made(cell: Cell) -> bool:
         raise BackendError(
             "other_sources", f"{cell.record.parent} holds what other sources or weights made.", hint="Choose another --out."
         )
+    if found["frames"] != list(cell.trial.frames):
+        raise BackendError("other_frames", f"{cell.record} is of the frames {found['frames']}.", hint="Choose another --out.")
     return True
 
 
@@ -204,6 +207,16 @@ def run(cell: Cell, record: Path) -> None:
         raise RuntimeError((done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1])
 
 
+def compare_trivial(root: Path, scenes: Sequence[Path], frames: tuple[int, int]) -> None:
+    """A record of what needs no reconstruction, of each scene that has none yet."""
+    for scene in scenes:
+        record = root / "trivial" / f"{scene.name}.json"
+        if not record.exists():
+            record.parent.mkdir(parents=True, exist_ok=True)
+            options = ("--pictures", root / "pictures", "--frames", f"{frames[0]}:{frames[1]}", "--out", record)
+            run_module("benchmarks.trade_score", scene, *options)
+
+
 def gather(root: Path, swept: Sequence[Sweep]) -> dict[str, Any]:
     """All cells of a folder, on which machine, with which versions and settings."""
     cells = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((root / "cells").glob("*/*.json"))]
@@ -219,7 +232,9 @@ def gather(root: Path, swept: Sequence[Sweep]) -> dict[str, Any]:
         for sweep in swept
     ]
     settings = {name: asdict(preset_config(name)) for name in PRESETS}
-    return {"machine": machine(), "versions": versions, "settings": settings, "sweeps": plan, "cells": cells}
+    trivial = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted((root / "trivial").glob("*.json"))}
+    facts = {"machine": machine(), "versions": versions, "settings": settings, "trivial": trivial}
+    return {**facts, "sweeps": plan, "cells": cells}
 
 
 if __name__ == "__main__":

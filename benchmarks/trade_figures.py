@@ -30,6 +30,7 @@ TITLES = {
     "input_smoke_db": "the clip itself, over the smoke, dB",
     "density_correlation": "correlation with the true density",
 }
+LEAST_SPAN = {"unseen_db": 1.0, "input_smoke_db": 1.0, "density_correlation": 0.05}  # what is nothing should look like nothing
 COLORS = {"draft": "tab:green", "preview": "tab:blue", "final": "tab:red"}
 
 
@@ -69,12 +70,17 @@ def draw_front(results: Mapping[str, Any]) -> Figure:
         best = front(points.values(), measure)
         xs, ys = [point.cost for point in best], [point.mean(measure) for point in best]
         panel.step(xs, ys, where="post", color="black", linewidth=1.0, zorder=1, label="the front")
+        panel.margins(0.14)
+        panel.autoscale_view()
+        low, high = panel.get_ylim()
+        more = max(0.5 * (LEAST_SPAN[measure] - (high - low)), 0.0)
+        panel.set_ylim(low - more, high + more)
         panel.set_xlabel("processor seconds, geometric mean over scenes")
         panel.set_title(TITLES[measure], fontsize=10)
         panel.set_xscale("log")
-        _plain_ticks(panel, [10, 15, 20, 30, 40, 60, 80, 120, 160, 240, 320])
+        _plain_ticks(panel, [5, 10, 15, 20, 25, 30, 40, 50, 60, 80, 100, 150, 200, 300])
         panel.grid(True, alpha=0.25)
-        panel.legend(fontsize=8, loc="lower right")
+        panel.legend(fontsize=8, loc="best")
     figure.suptitle("Stars: presets. Dots: their neighbours, coloured as the preset that they are changed from.", fontsize=10)
     figure.tight_layout()
     return figure
@@ -131,7 +137,7 @@ def _draw_sweep(panel: Axes, sweep: Mapping[str, Any], rows: list[dict[str, Any]
 
         gained.plot(sizes, over_base(gain), ".-", color=color, label=title)
     low, high = gained.get_ylim()
-    gained.set_ylim(min(low, -0.5), max(high, 0.5))  # what is nothing should look like nothing
+    gained.set_ylim(min(low, -LEAST_SPAN["unseen_db"]), max(high, LEAST_SPAN["unseen_db"]))
     gained.axhline(0.0, color="tab:blue", linewidth=0.5, alpha=0.5)
     gained.legend(fontsize=7, loc="upper left")
 

@@ -22,7 +22,7 @@ FOLLOWING = {"follow_clip": "true"}  # elsewhere the settings stand as they are:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
     """Settings: a preset with changes. frames: first and stop of the clip; scored_from: the first that is scored.
-    repeat: 0, or the number of a run that takes nothing over from others."""
+    repeat: 0, or the number of a run that takes nothing over from others, because it cannot or its own seconds count."""
 
     preset: str
     changes: tuple[tuple[str, str], ...] = ()
@@ -34,14 +34,14 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Tells it from all others, and does for the name of a file."""
+        """Tells it from all others of the same part of a clip, and does for the name of a file."""
         parts = [self.preset, *(f"{key}={value}" for key, value in self.changes)]
         if self.seed:
             parts.append(f"seed={self.seed}")
-        if self.frames != FRAMES or self.scored_from != FRAMES[0]:
+        if self.repeat or self.scored_from != self.frames[0]:
             parts.append(f"frames={self.frames[0]}-{self.frames[1]},{self.scored_from}")
-        if self.threads != 1 or self.repeat:
-            parts.append(f"threads={self.threads},{self.repeat}")
+        if self.threads != 1:
+            parts.append(f"threads={self.threads}")
         return " ".join(parts)
 
     @property
@@ -68,39 +68,32 @@ class Sweep:
 
 _AROUND_PREVIEW = (  # setting, stage, values; that of the preset is added
     ("visual.iterations", "visual", ("0", "3", "12", "24")),
-    ("visual.num_particles", "visual", ("1500", "3000", "12000", "24000")),
-    ("frames.working_size", "", ("128", "224", "480", "640")),
+    ("visual.num_particles", "visual", ("1500", "12000", "24000")),
+    ("frames.working_size", "", ("128", "224", "480")),
     ("visual.mass_iterations", "visual", ("2", "4", "16")),
     ("volume.use_prior", "volume", ("false",)),
-    ("volume.stride", "volume", ("1", "2", "6")),
+    ("volume.stride", "volume", ("1", "6")),
     ("export.max_voxels", "export", ("64", "128", "384")),
     ("physical.num_particles", "physical", ("400", "6000")),
-    ("visual.color", "visual", ("full", "one_hue")),
+    ("visual.color", "visual", ("one_hue",)),
 )
 _WITHOUT_PRIOR = (
     ("physical.num_particles", "physical", ("400", "6000")),
-    ("physical.solver_iterations", "physical", ("0", "1", "12")),
-    ("physical.correction_iterations", "physical", ("0", "1", "16")),
+    ("physical.solver_iterations", "physical", ("1", "12")),
+    ("physical.correction_iterations", "physical", ("0", "16")),
 )
 _TOGETHER = {
     "draft": (
         {"visual.iterations": "1"},
-        {"visual.iterations": "6"},
         {"visual.num_particles": "2000"},
-        {"visual.num_particles": "8000"},
         {"visual.mass_iterations": "3"},
         {"frames.working_size": "192"},
-        {"frames.working_size": "320"},
         {"volume.use_prior": "false"},
         {"visual.iterations": "6", "visual.num_particles": "2000"},
-        {"visual.iterations": "1", "visual.num_particles": "8000"},
         FOLLOWING,
     ),
     "preview": (
-        {"visual.iterations": "10", "visual.mass_iterations": "4"},
         {"visual.num_particles": "12000", "visual.iterations": "3"},
-        {"visual.num_particles": "12000", "visual.iterations": "12"},
-        {"visual.num_particles": "24000", "visual.iterations": "24"},
         FOLLOWING,
     ),
     "final": (
@@ -108,8 +101,6 @@ _TOGETHER = {
         {"visual.num_particles": "12000"},
         {"visual.mass_iterations": "6"},
         {"frames.working_size": "320"},
-        {"volume.use_prior": "false"},
-        {"visual.num_particles": "12000", "visual.iterations": "24"},
         FOLLOWING,
     ),
 }
@@ -121,7 +112,9 @@ def sweeps(*, threads: int, frames: tuple[int, int] = FRAMES) -> list[Sweep]:
     found += [_sweep((NO_PRIOR,), key, stage, values, frames) for key, stage, values in _WITHOUT_PRIOR]
     last = frames[1] - (frames[1] - frames[0]) // 2  # lengths are scored on the frames that all of them hold
     starts = [start for start in (last, frames[0], 2 * frames[0] - frames[1]) if start >= 0]
-    lengths = [Trial(preset="preview", frames=(start, frames[1]), scored_from=last) for start in starts]
+    lengths = [
+        Trial(preset="preview", frames=(start, frames[1]), scored_from=last, repeat=int(start != frames[0])) for start in starts
+    ]
     points = tuple((f"{trial.frames[1] - trial.frames[0]}", trial) for trial in lengths)
     found.append(Sweep(key="number of frames", base="preview", stage="", points=points))
     if threads > 1:
@@ -133,11 +126,13 @@ def sweeps(*, threads: int, frames: tuple[int, int] = FRAMES) -> list[Sweep]:
 
 
 def compared(*, frames: tuple[int, int] = FRAMES) -> list[Trial]:
-    """The presets, what stands near them, and the presets with other random numbers."""
-    where = {"frames": frames, "scored_from": frames[0]}
-    found = [Trial(preset=preset, **where) for preset in PRESETS]
-    found += [Trial(preset=name, changes=tuple(each.items()), **where) for name, several in _TOGETHER.items() for each in several]
-    return found + [Trial(preset=preset, seed=seed, **where) for seed in SEEDS[1:] for preset in PRESETS]
+    """The presets; then of each, the cheapest first, what stands near it, and itself with other random numbers."""
+    bases = {preset: Trial(preset=preset, frames=frames, scored_from=frames[0]) for preset in PRESETS}
+    found = list(bases.values())
+    for preset, base in bases.items():
+        found += [replace(base, changes=tuple(together.items())) for together in _TOGETHER[preset]]
+        found += [replace(base, seed=seed) for seed in SEEDS[1:]]
+    return found
 
 
 def with_donors(trials: Iterable[Trial]) -> list[Trial]:

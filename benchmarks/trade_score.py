@@ -2,17 +2,21 @@
 other, not for figures that stand beside published ones.
 
 Decibels are of sRGB on black, at most 50 a frame, as in `evaluate`; means over frames.
+
+    python -m benchmarks.trade_score SCENE --pictures DIR --frames A:B --out FILE    what needs no reconstruction
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from backend.contract.truth import INPUT_VIEW
-from backend.io.atomic import whole_file
+from backend.io.atomic import whole_file, write_text
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.io.vdb import read_vdb
@@ -139,3 +143,14 @@ def _moments(truth: TruthSet, scored: tuple[int, int]) -> list[tuple[int, Volume
 def _mean(values: list[float]) -> float:
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else float("nan")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    for name in ("pictures", "out"):
+        parser.add_argument(f"--{name}", type=Path, required=True)
+    parser.add_argument("--frames", required=True)
+    given = parser.parse_args()
+    first, stop = map(int, given.frames.split(":"))
+    write_text(given.out, json.dumps(trivial_scores(given.scene, given.pictures, scored=(first, stop)), allow_nan=False))

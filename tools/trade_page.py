@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from tools.reconstruction_page import shown, table
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 FIGURES = DOCS / "results" / "trade.json"
+GUARD = DOCS / "results" / "guard.json"
 PAGE = DOCS / "trade.md"
 
 TITLES = {"unseen_db": "unseen views, dB", "input_smoke_db": "the clip, dB", "density_correlation": "density"}
@@ -34,6 +35,14 @@ COLUMNS = {  # of the tables of settings: score, form
     "future_input_db": ("FP (IV)", ".2f"),
     "future_nvs_db": ("FP (NV)", ".2f"),
 }
+GUARDED = {
+    "input_smoke_db": "the clip, smoke",
+    "nvs_db": "NVS",
+    "side_db": "side",
+    "future_input_db": "FP (IV)",
+    "density_correlation": "density",
+    "vdb_correlation": "density of the VDB",
+}
 EXPORT_COLUMNS = {"vdb_correlation": ("density of the VDB", ".3f"), "vdb_mib_a_frame": ("MiB a frame", ".2f")}
 
 
@@ -41,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     options = parser.parse_args()
-    text = page(json.loads(FIGURES.read_text(encoding="utf-8")))
+    text = page(*read())
     if options.check:
         is_same = PAGE.is_file() and PAGE.read_text(encoding="utf-8") == text
         print("docs/trade.md agrees with its figures" if is_same else "docs/trade.md is out of date: python -m tools.trade_page")
@@ -50,7 +59,13 @@ def main() -> int:
     return 0
 
 
-def page(results: Mapping[str, Any]) -> str:
+def read() -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What bench measured, and the guard's entries."""
+    trade, guard = (json.loads(path.read_text(encoding="utf-8")) for path in (FIGURES, GUARD))
+    return trade, guard
+
+
+def page(results: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> str:
     cells = results["cells"]
     noise = noise_of(cells)
     points = whole(results)
@@ -60,6 +75,7 @@ def page(results: Mapping[str, Any]) -> str:
             how(results),
             "## Presets\n",
             *presets(points, noise),
+            *trivial(results["trivial"]),
             *([PICTURE_FRONT] if (DOCS / "images" / "trade_front.png").is_file() else []),
             "## The front\n",
             *fronts(points),
@@ -70,6 +86,8 @@ def page(results: Mapping[str, Any]) -> str:
             *settings(results),
             "## What is noise\n",
             *noises(noise, len({cell["scene"] for cell in cells})),
+            "## The guard\n",
+            *guarded(entries),
         ]
     )
 
@@ -125,6 +143,15 @@ def presets(points: Mapping[str, Point], noise: Mapping[str, float]) -> list[str
         "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, in density.\n"
     )
     return [table(head, rows), words]
+
+
+def trivial(found: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """What a reconstruction must be better than."""
+    if not found:
+        return []
+    columns = {"nvs_copy_db": "NVS", "nvs_mirror_db": "NVS, mirrored", "side_copy_db": "side", "side_mirror_db": "side, mirrored"}
+    rows = [[scene, *(shown(scores.get(name), ".2f") for name in columns)] for scene, scores in found.items()]
+    return ["The input picture itself in the other views, dB:\n", table(["scene", *columns.values()], rows)]
 
 
 def fronts(points: Mapping[str, Point]) -> list[str]:
@@ -190,6 +217,25 @@ def noises(noise: Mapping[str, float], num_scenes: int) -> list[str]:
         "smallest that anyone would choose a setting for.\n"
     )
     return [words, table(["figure", "deviation", "smallest that counts"], rows)]
+
+
+def guarded(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    words = (
+        "The ordinary tests run two small jobs and fail where a score falls by more than 0.3 dB or 0.01, or counted work rises "
+        "by more than 15 %, against the last entry of `docs/results/guard.json`. An entry is made on purpose, with its reason: "
+        '`python -m benchmarks.guard --add "Reason."`.\n'
+    )
+    parts = [words]
+    for case in entries[-1]["cases"] if entries else ():
+        kinds = list(entries[-1]["cases"][case]["work"])
+        rows = []
+        for entry in entries:
+            scores, work = entry["cases"][case]["scores"], entry["cases"][case]["work"]
+            figures = [shown(scores.get(name), ".3f" if "correlation" in name else ".2f") for name in GUARDED]
+            rows.append([entry["reason"], entry["code"], *figures, *(f"{work.get(kind, 0) / 1e6:.1f}" for kind in kinds)])
+        named = [f"{kind.replace('_', ' ')}, million" for kind in kinds]
+        parts += [f"Small job {case}:\n", table(["reason", "sources", *GUARDED.values(), *named], rows)]
+    return parts
 
 
 def title(sweep: Mapping[str, Any]) -> str:
