@@ -103,6 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
     if given.page:
         run_module("benchmarks.reconstruction_figures", root, "--out", DOCS / "images", "--from", given.source.resolve())
         run_module("tools.results")
+        run_module("tools.estimate_quality")
     return 1 if failures else 0
 
 

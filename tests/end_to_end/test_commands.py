@@ -124,7 +124,8 @@ def test_inspect_gives_its_reasons(plume: Path) -> None:
     assert all(item.seconds > 0.0 and item.memory_gib > 0.0 for item in outlook.estimates)
 
 
-def test_a_job_keeps_what_was_decided_and_estimated_and_says_what_is_left(job: Path) -> None:
+def test_a_job_keeps_what_was_decided_and_estimated_and_says_what_is_left(job: Path, plume: Path, tmp_path: Path) -> None:
+    job = shutil.copytree(job, tmp_path / "job")
     decisions = read_decisions(job)
     assert decisions["extraction"].value == "on_black" and decisions["depth"].value == "silhouette"
     assert decisions["resolution"].is_overridden, "the small job sets frames.working_size"
@@ -134,9 +135,9 @@ def test_a_job_keeps_what_was_decided_and_estimated_and_says_what_is_left(job: P
     assert expected.fingerprint == decisions.fingerprint and expected.quality == (), "its settings were never measured"
     shutil.rmtree(job / "vdb")
     (job / "result.json").unlink()
-    heard = [events.decode(line) for line in backend("run", "--job", job).stdout.splitlines()]
+    heard = [events.decode(line) for line in backend("reconstruct", plume, "--job", job, *settings()).stdout.splitlines()]
     steps = [event for event in heard if isinstance(event, events.Progress)]
-    assert steps and all(step.stage == "export" and step.job_seconds_left is not None for step in steps)
+    assert steps and all(step.stage in ("forecast", "export") and step.job_seconds_left is not None for step in steps)
     assert all(step.seconds_left is not None for step in steps) and steps[-1].job_seconds_left == 0.0
     kinds = [event.kind for event in heard if isinstance(event, events.Artifact)]
     assert kinds[:2] == ["decisions", "estimate"]
