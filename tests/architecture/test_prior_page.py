@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from backend.prior.weights import WEIGHTS
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COLUMNS = ("density1", "density2", "sideways2", "up2", "depth2")
 
 
-def test_the_page_shows_the_log_of_the_training() -> None:
+@pytest.mark.parametrize(("name", "passes"), [("prior_training", 8), ("prior_training_on", 4)])
+def test_the_page_shows_the_log_of_the_training(name: str, passes: int) -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
-    log = (CHECKOUT / "docs" / "results" / "prior_training.jsonl").read_text(encoding="utf-8").splitlines()
-    assert len(log) == 8
+    assert f"docs/results/{name}.jsonl" in page
+    log = (CHECKOUT / "docs" / "results" / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    assert len(log) == passes
     for line in log:
         entry = json.loads(line)
         cells = " | ".join(f"{entry[name]:.3f}" for name in COLUMNS)
