@@ -22,12 +22,13 @@ from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.decisions import DECISIONS_FILE, read_decisions
 from backend.contract.errors import BackendError
-from backend.contract.estimates import ESTIMATE_FILE, Estimate, read_estimate
+from backend.contract.estimates import ESTIMATE_FILE, kept_estimate
 from backend.contract.job import Config, Job, read_job
 from backend.contract.light import Light
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.estimate.predict import estimate
 from backend.estimate.time_left import TimeLeft
+from backend.estimate.work import asks_prior
 from backend.events_out import EventSink, StageReport, StopRequest
 from backend.fit import light
 from backend.fit.lift import buoyancy_of, wind_of
@@ -51,11 +52,7 @@ STAGES = ("inspect", "frames", "smoke", "cameras", "volume", "physical", "visual
 
 def stages_of(config: Config) -> tuple[str, ...]:
     """The stages of a job with these settings, in order."""
-    return STAGES if _asks_prior(config) else tuple(name for name in STAGES if name != "volume")
-
-
-def _asks_prior(config: Config) -> bool:
-    return config.volume.use_prior and config.method == "default"
+    return STAGES if asks_prior(config) else tuple(name for name in STAGES if name != "volume")
 
 
 def run_job(path: Path, sink: EventSink, stop: StopRequest, *, weights: Path = WEIGHTS) -> Result:
@@ -140,21 +137,13 @@ class Pipeline:
         decisions = read_decisions(self.folder.path)
         self.config = decisions.followed(self.config)
         self.stages = stages_of(self.config)
-        self.weights_mark = weights_fingerprint(self.weights) if _asks_prior(self.config) else None
-        expected = self._expected(mark)
+        self.weights_mark = weights_fingerprint(self.weights) if asks_prior(self.config) else None
+        expected = kept_estimate(self.folder.path, fingerprint=mark)
         ahead = self.stages[1:]
         self.time_left = TimeLeft({name: expected.stages.get(name, 0.0) for name in ahead} if expected is not None else {})
         self.sink.send(events.Artifact(kind="decisions", path=DECISIONS_FILE))
         if expected is not None:
             self.sink.send(events.Artifact(kind="estimate", path=ESTIMATE_FILE))
-
-    def _expected(self, mark: str) -> Estimate | None:
-        """What this job was estimated to take; None where no such file can be read: then the pace alone tells."""
-        try:
-            found = read_estimate(self.folder.estimate.read_text(encoding="utf-8"))
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return None
-        return found if found.fingerprint == mark else None
 
     def _frames(self, clip: Clip) -> str:
         config = self.config.frames

@@ -6,8 +6,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from .decisions import Decisions, decisions_of
@@ -86,6 +88,15 @@ def read_estimate(text: str) -> Estimate:
     if data.pop("format_version") != ESTIMATE_FORMAT_VERSION:
         raise ValueError("another format version")
     return estimate_of(data)
+
+
+def kept_estimate(job_folder: str | os.PathLike[str], *, fingerprint: str) -> Estimate | None:
+    """What a job was estimated to take; None where its file is another's or cannot be read: then its pace alone tells."""
+    try:
+        found = read_estimate((Path(job_folder) / ESTIMATE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return found if found.fingerprint == fingerprint else None
 
 
 def estimate_of(data: Mapping[str, Any]) -> Estimate:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backend.contract.estimates import Estimate, Quality, quality_text, read_estimate, spoken
+from backend.contract.estimates import Estimate, Quality, kept_estimate, quality_text, read_estimate, spoken
 from backend.contract.job import PRESETS, override, preset_config
 from backend.estimate import machine as machines
 from backend.estimate.machine import PIECES, Machine, fastest, machine_key, this_machine
@@ -172,6 +172,15 @@ def test_a_damaged_estimate_is_refused(change: dict) -> None:
     item = Estimate(preset="draft", seconds=60.0, stages={"visual": 60.0}, memory_gib=0.6)
     with pytest.raises((ValueError, TypeError, KeyError, AttributeError)):
         read_estimate(json.dumps(json.loads(item.to_json()) | change))
+
+
+def test_an_estimate_of_another_job_is_none(tmp_path: Path) -> None:
+    item = Estimate(preset="draft", seconds=60.0, stages={"visual": 60.0}, memory_gib=0.6, fingerprint="abc")
+    assert kept_estimate(tmp_path, fingerprint="abc") is None
+    (tmp_path / "estimate.json").write_text(item.to_json(), encoding="utf-8")
+    assert kept_estimate(tmp_path, fingerprint="abc") == item and kept_estimate(tmp_path, fingerprint="abd") is None
+    (tmp_path / "estimate.json").write_text(item.to_json()[:-9], encoding="utf-8")
+    assert kept_estimate(tmp_path, fingerprint="abc") is None
 
 
 # -- the machine
