@@ -15,12 +15,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, settings
-
-settings.register_profile(
-    "extremes", deadline=None, derandomize=True, database=None, max_examples=40, suppress_health_check=list(HealthCheck)
-)
-settings.load_profile("extremes")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,6 +22,7 @@ from backend.contract.result import read_result
 from backend.fit.state import PhysicalRecord
 from backend.io.particles import ParticleFrame, ParticlesInfo, ParticlesWriter, read_particles
 from backend.io.records import RecordFile
+from tests.extremes.draws import same_draws
 from tests.extremes.small_fit import around
 from tests.reference.refusals import told
 
@@ -284,6 +285,7 @@ def test_changed_headers_of_particles(table, tmp_path: Path):
     assert all_of(old)[0] == INFO  # as an older program wrote it
 
 
+@same_draws
 @given(count=st.integers(-(2**63), 2**63 - 1), place=st.integers(0, 3))
 def test_any_count_in_the_offsets(tmp_path_factory, count: int, place: int):
     path = asset(tmp_path_factory.mktemp("counts") / "particles.h5")

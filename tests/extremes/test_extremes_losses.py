@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backend.fit import losses
+from tests.extremes.draws import same_draws
 from tests.reference.refusals import refuses
 
 PART = "Losses"
@@ -70,7 +71,7 @@ def test_gradients_at_odd_sizes_are_the_finite_differences(table):
             worst = max(worst, abs(found - slope) / max(abs(slope), 1e-3))
     table.row(
         "gradients at odd sizes", tried="1 x 1 to 31 x 17", happens="exact",
-        measure="relative error against finite differences", worst=worst, bound=1e-3,
+        measure="relative error against finite differences", worst=worst, bound=1e-5,
     )  # fmt: skip
 
 
@@ -137,6 +138,7 @@ def test_a_band_without_a_frequency_is_refused():
         losses.frequency(*pictures((1, 1, 1)))
 
 
+@same_draws
 @given(
     seed=st.integers(0, 2**31), channels=st.integers(1, 4), height=st.integers(1, 20), width=st.integers(1, 20),
     bright=st.floats(-30, 12), dark=st.floats(-30, 12), share=st.floats(0, 1),

@@ -19,9 +19,11 @@ from backend.physics.fluid_gradient import rollout
 from backend.physics.fluid_torch import step_torch
 from backend.physics.kernels import POLY6
 from backend.physics.neighbours import find_neighbours
+from tests.extremes.draws import same_draws
 from tests.reference.refusals import refuses
 
 PART = "Physics"
+pytestmark = pytest.mark.timeout(3600)  # of the whole ranges, on a busy core
 
 
 def state_of(positions, velocities=None) -> FluidState:
@@ -198,6 +200,7 @@ def test_the_largest_numbers_allowed(dt, length):
     assert np.abs(after.positions - state.positions).max() <= 3.0 * report.substeps * length
 
 
+@same_draws
 @given(
     exponents=st.tuples(*[st.floats(-9, 3), st.floats(-6, 30), st.floats(-4, 4), st.floats(-4, 4), st.floats(-6, 6)]),
     seed=st.integers(0, 1000),
@@ -376,7 +379,7 @@ def test_gradients_are_finite_everywhere(table):
     table.row(
         "gradients of three steps",
         tried=f"{tried} cases: 0 to 60 particles, coincident to far apart, dt 1e-9 to 1e3 s, buoyancy 0 and 1e4",
-        happens="finite everywhere", measure="largest, by a position", worst=largest, bound=1e6,
+        happens="finite everywhere", measure="largest, by a position", worst=largest, bound=100,
     )  # fmt: skip
 
 
@@ -396,7 +399,7 @@ def test_single_precision_against_double(table):
     )  # fmt: skip
     table.row(
         "compiled step against its twin, float32", tried="the same", happens="what float32 would cost", measure="difference, m",
-        worst=worst[torch.float32], bound=1e-4,
+        worst=worst[torch.float32], bound=1e-5,
     )  # fmt: skip
 
 

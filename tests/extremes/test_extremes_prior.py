@@ -114,7 +114,7 @@ def test_any_density_scale_pace_and_place(table, prior: Prior):
     )  # fmt: skip
     table.row(
         "distance of the world's origin", tried="1e6 m along each axis", happens="the same answer",
-        measure="difference / largest", worst=off(ask(prior, away=1e6), 1.0, 1.0), bound=1e-3,
+        measure="difference / largest", worst=off(ask(prior, away=1e6 + 1 / 3), 1.0, 1.0), bound=1e-3,
     )  # fmt: skip
 
 
@@ -168,5 +168,5 @@ def test_the_stage_and_what_follows_it(table, prior: Prior):
     )  # fmt: skip
     table.row(
         "scale of such a fit", tried="1e-4 of 10 m", happens="the same pictures", measure="difference of opacities",
-        worst=worst, bound=0.03,
+        worst=worst, bound=0.01,
     )  # fmt: skip

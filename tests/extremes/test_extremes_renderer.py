@@ -15,11 +15,13 @@ from backend.geometry.camera import View
 from backend.render import layers, splat, torch_twin
 from backend.render.gaussians import Gaussians
 from backend.render.projection import DILATION, NEAR
+from tests.extremes.draws import same_draws
 from tests.reference.ray_integrals import optical_depth
 from tests.reference.refusals import refuses
 from tests.reference.smoke_scenes import cloud, one, plain_view
 
 PART = "Renderer"
+pytestmark = pytest.mark.timeout(3600)  # of the whole ranges, on a busy core
 VIEW = plain_view(96, 64, 80.0)
 
 
@@ -75,8 +77,9 @@ def test_coincident_gaussians_add_up(table):
         image = everything(many(single, count))[0].image
         worst = max(worst, float(np.abs(image / count - unit).max() / unit.max()))
     table.row(
-        "all particles in one place", tried=f"1 to {max(counts):,}", happens="their optical depths add up",
-        measure="error / largest optical depth", worst=worst, bound=2e-3,
+        "all particles in one place", tried=f"1 to {max(counts):,}",
+        happens="their optical depths add up; sums in float32 lose digits from 1e5 on", measure="error / largest optical depth",
+        worst=worst, bound=1e-2,
     )  # fmt: skip
 
 
@@ -131,7 +134,7 @@ def test_a_needle_keeps_its_profile(table):
             worst = max(worst, abs(float(across.sum()) / expected - 1))
     table.row(
         "aspect of a splat", tried="1 to 1e6, five directions", happens="a needle keeps its width and its mass per length",
-        measure="relative error across", worst=worst, bound=1e-2,
+        measure="relative error across", worst=worst, bound=1e-4,
     )  # fmt: skip
 
 
@@ -292,7 +295,7 @@ def test_any_field_of_view(table):
     table.row(
         "field of view", tried="0.1 to 170 degrees, in the middle and at 0.7 of the edge",
         happens="drawn by a first-order expansion", measure="relative error of the mass against exact rays", worst=worst,
-        bound=0.15,
+        bound=0.08,
     )  # fmt: skip
 
 
@@ -399,13 +402,14 @@ def test_single_precision_against_the_twin_in_double(table):
     )  # fmt: skip
     table.row(
         "float32 against float64, gradients", tried="the same, for every input", happens="they agree with autograd in float64",
-        measure="error / largest of the input", worst=worst_gradient, bound=2e-3,
+        measure="error / largest of the input", worst=worst_gradient, bound=0.0002,
     )  # fmt: skip
 
 
 wide = st.floats(-30.0, 30.0).map(math.exp)
 
 
+@same_draws
 @given(
     seed=st.integers(0, 2**31), size=wide, mass=wide, aspect=st.floats(-30.0, 0.0).map(math.exp), depth=wide,
     degrees=st.floats(0.1, 170.0), width=st.integers(1, 70), height=st.integers(1, 70),
