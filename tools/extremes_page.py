@@ -1,6 +1,7 @@
 """docs/extremes.md from the table that the suite of the extremes writes; nothing in it is typed by hand.
 
 python -m tools.extremes_page            runs the suite over the whole ranges, then writes the figures and the page
+python -m tools.extremes_page --file F   runs one file of it again and replaces that file's lines
 python -m tools.extremes_page --page     writes the page from the figures that are there
 python -m tools.extremes_page --check    says whether the page agrees with the figures
 """
@@ -27,18 +28,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--page", action="store_true")
     parser.add_argument("--check", action="store_true")
+    parser.add_argument("--file", metavar="F", help="such as test_extremes_export.py")
     options = parser.parse_args()
     if options.check:
         is_same = PAGE.is_file() and PAGE.read_text(encoding="utf-8") == page(load())
         print("docs/extremes.md agrees with its figures" if is_same else "out of date: python -m tools.extremes_page --page")
         return 0 if is_same else 1
-    if not options.page:
-        command = [sys.executable, "-m", "pytest", str(SUITE), "--extremes=full", f"--extremes-table={FIGURES}"]
-        code = subprocess.run(command, cwd=CHECKOUT, check=False).returncode
-        if code != 0:
-            return code
+    if not options.page and not run(options.file):
+        return 1
     PAGE.write_text(page(load()), encoding="utf-8")
     return 0
+
+
+def run(file: str | None) -> bool:
+    """The suite, or one file of it, over the whole ranges; the figures are written if nothing failed."""
+    before = load() if file else None
+    target = SUITE / file if file else SUITE
+    command = [sys.executable, "-m", "pytest", str(target), "--extremes=full", f"--extremes-table={FIGURES}"]
+    if subprocess.run(command, cwd=CHECKOUT, check=False).returncode != 0:
+        return False
+    if before is not None:
+        kept = [row for row in before["rows"] if row["test"].partition("::")[0] != file]
+        figures = {**before, "rows": kept + load()["rows"]}
+        FIGURES.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return True
 
 
 def load() -> dict[str, Any]:
@@ -61,13 +74,22 @@ def page(figures: dict[str, Any]) -> str:
     ]
     for part in PARTS:
         lines = [
-            [row["quantity"], row["tried"], row["happens"], row["measure"], number(row["worst"]), number(row["bound"])]
+            [
+                *(plain(row[name]) for name in ("quantity", "tried", "happens", "measure")),
+                number(row["worst"]),
+                number(row["bound"]),
+            ]
             for row in rows
             if row["part"] == part
         ]
         if lines:
             parts += [f"## {part}\n", table(["quantity", "range tried", "what happens", "measure", "worst", "bound"], lines)]
     return "\n".join(parts)
+
+
+def plain(text: str) -> str:
+    """As a cell: a bar would end it."""
+    return text.replace("|", r"\|")
 
 
 def number(value: float) -> str:

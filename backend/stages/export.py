@@ -30,6 +30,7 @@ COLOR_THRESHOLD = 0.04  # weighted standard deviation of a linear colour channel
 SMALLEST_VOXEL = 1.5e-5  # m; OpenVDB takes the transform of smaller ones (volume below 3e-15 m^3) for singular
 
 _TRIM = 5e-4  # share of the optical mass on either side of an axis that may be left out where it would coarsen all the rest
+_COARSE = 10.0  # times the size that the particles ask for: worth a warning
 _MAX_LOST = 2e-3  # share of the optical mass lost through trimming that is worth a warning
 _MARGIN = 6  # voxels: widening to MIN_SCALE_VOXELS and rounding outward on both sides
 
@@ -67,6 +68,12 @@ def plan_export(particles: Particles, config: ExportConfig, report: Report) -> E
             "voxel_size_limited",
             f"Voxels of {wanted:g} m are smaller than OpenVDB can hold; they are {voxel_size:g} m. A larger scene has room for "
             "detail: set cameras.distance_m, or give cameras in larger units.",
+        )
+    elif not config.voxel_size and voxel_size > _COARSE * wanted:
+        report.warning(
+            "voxels_coarse",
+            f"The smoke spans {longest:.3g} m, so that its voxels are {voxel_size:.3g} m where particles ask for {wanted:.3g} m: "
+            "some of it lies far off. A larger export.max_voxels allows finer ones.",
         )
     elif config.voxel_size and voxel_size > config.voxel_size:
         report.warning(

@@ -119,18 +119,26 @@ def test_empty_and_odd_smoke(table, tmp_path: Path):
 
 
 def test_one_particle_that_flew_away(table, tmp_path: Path):
-    """A stray must not coarsen all the rest, and what is left out is told."""
-    frame = frame_of(400)
-    far = frame.positions.copy()
-    far[0] = 1e9
-    masses, warnings = exported(tmp_path, [replace(frame, positions=far)], ExportConfig(max_voxels=64))
-    total = float(frame.optical_masses.sum(dtype=np.float64))
-    lost = 1 - masses[0] / total
-    share = float(frame.optical_masses[0]) / total
-    assert ("smoke_outside" in warnings) or lost <= 2e-3
+    """A faint stray is left out; one that holds too much smoke for that makes all voxels coarse. Either is told."""
+    silent, worst = 0, 0.0
+    for count in (400, 20_000):
+        for away in (1e2, 1e9):
+            frame = frame_of(count)
+            far = frame.positions.copy()
+            far[0] = away
+            total = float(frame.optical_masses.sum(dtype=np.float64))
+            share = float(frame.optical_masses[0]) / total
+            masses, warnings = exported(tmp_path, [replace(frame, positions=far)], ExportConfig(max_voxels=64))
+            worst = max(worst, abs(1 - masses[0] / total) - 1.05 * share)
+            silent += share > 2e-3 and not {"smoke_outside", "voxels_coarse"} & set(warnings)
     table.row(
-        "a stray particle", tried="1e9 m off", happens="left out of the grid, with a warning from 0.2 % on",
-        measure="mass lost besides its own, share", worst=abs(lost - share) if lost > 1e-6 else 0.0, bound=0.01,
+        "a stray particle", tried="100 m and 1e9 m off, with 0.3 % and less than 0.01 % of the smoke",
+        happens="left out where it is faint; else voxels are coarse, with a warning", measure="cases not told", worst=silent,
+        bound=0,
+    )  # fmt: skip
+    table.row(
+        "mass without the stray", tried="the same", happens="all else is in the grid",
+        measure="share lost beyond the stray's own", worst=worst, bound=2e-3,
     )  # fmt: skip
 
 
@@ -194,8 +202,8 @@ def test_any_forecast(table):
     table.row(
         "forecasts",
         tried=f"{tried} cases: 0, 1, 60 particles, up to {horizon} frames, fading 0 to 100, spreading 0 to 10, 1 and 1000 fps",
-        happens="finite; as much smoke as the last frame shows",
-        measure="largest optical mass / that of the last frame", worst=worst, bound=1.5,
+        happens="finite; as much smoke as the last frame shows", measure="largest optical mass / that of the last frame",
+        worst=worst, bound=1.5,
     )  # fmt: skip
 
 
