@@ -74,7 +74,7 @@ class Variant:
 
 SMALL = {"frames.working_size": "80", "visual.num_particles": "24000"}  # some twenty particles a pixel of smoke
 VARIANTS = (
-    Variant(name="matte", decision="extraction", question="smoke on black is matted", changes={"extraction.mode": "matte"}),
+    Variant(name="matte", decision="extraction", question="smoke that is cut out already is matted", changes={"extraction.mode": "matte"}),
     Variant(name="still", decision="camera", question="a moving camera is left out", changes={"cameras.mode": "still"}),
     Variant(
         name="silhouette",
@@ -105,13 +105,6 @@ VARIANTS = (
         question="the prior is left out, twice as far around",
         changes={"volume.use_prior": "false"},
         frames=(52, 82),
-    ),
-    Variant(
-        name="silhouette, half of it",
-        decision="depth",
-        question="the prior is left out, four times as far around",
-        changes={"volume.use_prior": "false"},
-        frames=(40, 100),
     ),
     Variant(
         name="few pixels",
