@@ -7,6 +7,7 @@ machine.json says for which version, processor and number of threads it holds; f
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import platform
@@ -64,6 +65,7 @@ def machine_key() -> dict[str, Any]:
     return {
         "version": __version__,
         "kernels": sources_fingerprint(),
+        "pieces": hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16],
         "processor": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": numba.get_num_threads(),

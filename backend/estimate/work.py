@@ -43,7 +43,7 @@ def memory_terms(seen: Survey, config: Config) -> dict[str, float]:
         "program": 1.0,
         "prior": float(asks_prior(config)),
         "source_megapixel": seen.source_size[0] * seen.source_size[1] / 1e6,
-        "matte_megapixel": pixels * min(config.extraction.plate_frames, seen.num_frames) / 1e6 * (seen.mode == "matte"),
+        "matte_megapixel": pixels / 1e6 * (seen.mode == "matte"),
         "particle": settings.num_particles / NUM_PARTICLES,
     }
 
