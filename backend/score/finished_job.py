@@ -105,16 +105,19 @@ def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, 
 
 
 def job_facts(job: FinishedJob) -> dict[str, Any]:
-    """Program, preset, method, and the seconds of its stages as far as the job knows them."""
+    """Program, preset and method; no times, so that equal jobs have equal scores."""
     provenance = job.particles.info.provenance
     settings = provenance.get("settings", {})
-    facts = {"program": provenance.get("program"), "preset": provenance.get("preset"), "method": settings.get("method")}
+    return {"program": provenance.get("program"), "preset": provenance.get("preset"), "method": settings.get("method")}
+
+
+def stage_seconds(job: FinishedJob) -> dict[str, float]:
+    """Wall-clock seconds of every stage of the job's last run, as far as it kept them: a note for people."""
     try:
         seconds = json.loads(job.folder.timing.read_text(encoding="utf-8"))
-        facts["seconds"] = {str(stage): float(value) for stage, value in seconds.items()}
+        return {str(stage): float(value) for stage, value in seconds.items()}
     except (OSError, ValueError, TypeError, AttributeError):
-        facts["seconds"] = {}  # a note for people, not part of the result
-    return facts
+        return {}
 
 
 def check_world(cameras: Cameras, truth: Truth, anchor: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from backend.io.atomic import write_text
 from backend.reporting import Report
-from backend.score.finished_job import FinishedJob
+from backend.score.finished_job import FinishedJob, stage_seconds
 from backend.score.page import cycles, markup, views, volumes
 from backend.score.relight import RelightConfig
 from backend.score.truth_set import Truth
@@ -54,7 +54,7 @@ def write_report(
         _volumes(scores, job, truth),
         markup.section("motion", "Motion", _motion(scores)),
         markup.section("views", "Every answer in every view", views.tables(scores)),
-        markup.section("cost", "What it cost", _cost(scores)),
+        markup.section("cost", "What it cost", _cost(stage_seconds(job))),
         markup.section("reading", "How to read this", *map(markup.paragraph, _READING)),
     ]
     write_text(path, markup.page(title, "\n".join(filter(None, parts))))
@@ -123,8 +123,7 @@ def _motion(scores: Mapping[str, Any]) -> str:
     return flow + markup.table(["figure", "value"], rows, caption="Particles, means over the fitted frames")
 
 
-def _cost(scores: Mapping[str, Any]) -> str:
-    seconds = scores["job"].get("seconds", {})
+def _cost(seconds: Mapping[str, float]) -> str:
     if not seconds:
         return markup.paragraph("The job does not know how long it took.")
     rows = [[escape(stage), markup.number(value, 1)] for stage, value in seconds.items()]
