@@ -104,22 +104,24 @@ def draw_sweeps(results: Mapping[str, Any]) -> Figure:
 
 
 def sweep_rows(sweep: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each value that was measured on every scene that the base was: value, name and cells by scene."""
+    """A row for each value that was measured: value, name, and its cells by scene, on scenes that the base was measured on."""
     found = []
     for value, name in sweep["points"]:
         here = {cell["scene"]: cell for cell in cells if cell["name"] == name}
         found.append({"value": value, "name": name, "cells": here})
-    base = next((row for row in found if row["name"] == sweep["base"]), found[0])
-    return [row for row in found if row["cells"] and row["cells"].keys() == base["cells"].keys()]
+    base = next((row for row in found if row["name"] == sweep["base"] and row["cells"]), found[len(found) // 2])
+    for row in found:
+        row["cells"] = {scene: cell for scene, cell in row["cells"].items() if scene in base["cells"]}
+    return [row for row in found if row["cells"]]
 
 
 def _draw_sweep(panel: Axes, sweep: Mapping[str, Any], rows: list[dict[str, Any]]) -> None:
     base = next((row for row in rows if row["name"] == sweep["base"]), rows[len(rows) // 2])
     sizes = [max(float(row["value"]), 0.5) for row in rows]
-    scenes = sorted(base["cells"])
 
     def over_base(read: Any) -> list[float]:
-        return [sum(read(row["cells"][scene], base["cells"][scene]) for scene in scenes) / len(scenes) for row in rows]
+        """Means over each row's own scenes, against the base on the same ones."""
+        return [sum(read(cell, base["cells"][scene]) for scene, cell in row["cells"].items()) / len(row["cells"]) for row in rows]
 
     panel.plot(sizes, over_base(lambda cell, other: cell["cpu_seconds"] / other["cpu_seconds"]), "k.-", label="cost")
     panel.axvline(max(float(base["value"]), 0.5), color="grey", linewidth=0.8, linestyle=":")

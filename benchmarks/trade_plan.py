@@ -69,7 +69,7 @@ class Sweep:
 _AROUND_PREVIEW = (  # setting, stage, values; that of the preset is added
     ("visual.iterations", "visual", ("0", "3", "12", "24")),
     ("visual.num_particles", "visual", ("1500", "12000", "24000")),
-    ("frames.working_size", "", ("128", "224", "480")),
+    ("frames.working_size", "", ("128", "224")),
     ("visual.mass_iterations", "visual", ("2", "4", "16")),
     ("volume.use_prior", "volume", ("false",)),
     ("volume.stride", "volume", ("1", "6")),
@@ -90,17 +90,19 @@ _TOGETHER = {
         {"frames.working_size": "192"},
         {"volume.use_prior": "false"},
         {"visual.iterations": "6", "visual.num_particles": "2000"},
+        {"frames.working_size": "192", "visual.mass_iterations": "2"},
         FOLLOWING,
     ),
     "preview": (
         {"visual.num_particles": "12000", "visual.iterations": "3"},
+        {"visual.num_particles": "12000", "visual.iterations": "3", "visual.mass_iterations": "2"},
+        {"frames.working_size": "192", "visual.mass_iterations": "2"},
         FOLLOWING,
     ),
     "final": (
         {"visual.iterations": "8"},
         {"visual.num_particles": "12000"},
-        {"visual.mass_iterations": "6"},
-        {"frames.working_size": "320"},
+        {"visual.mass_iterations": "2"},
         FOLLOWING,
     ),
 }
