@@ -74,7 +74,12 @@ class Variant:
 
 SMALL = {"frames.working_size": "80", "visual.num_particles": "24000"}  # some twenty particles a pixel of smoke
 VARIANTS = (
-    Variant(name="matte", decision="extraction", question="smoke that is cut out already is matted", changes={"extraction.mode": "matte"}),
+    Variant(
+        name="matte",
+        decision="extraction",
+        question="smoke that is cut out already is matted",
+        changes={"extraction.mode": "matte"},
+    ),
     Variant(name="still", decision="camera", question="a moving camera is left out", changes={"cameras.mode": "still"}),
     Variant(
         name="silhouette",
