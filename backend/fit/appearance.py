@@ -16,7 +16,7 @@ from backend.fit import depth_prior, explain
 from backend.fit.colors import hue_of
 from backend.fit.depths import Depths
 from backend.fit.follow import drawn_level, drawn_near, points_on_rays
-from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
+from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
@@ -123,6 +123,7 @@ class Appearance:
             iterations=self.config.mass_iterations,
             consistency=consistency,
         )
+        masses = not_grown_beside(masses, record.optical_masses, record.positions, view)
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 

@@ -37,6 +37,19 @@ def is_near_image(positions: np.ndarray, view: View) -> np.ndarray:
     return (depth > 0) & (x > -MARGIN) & (x < 1 + MARGIN) & (y > -MARGIN) & (y < 1 + MARGIN)
 
 
+def is_in_image(positions: np.ndarray, view: View) -> np.ndarray:
+    """[N] bool: the image shows the middle of the particle."""
+    pixels, depth = view.project(positions)
+    x, y = pixels[:, 0] / view.width, pixels[:, 1] / view.height
+    return (depth > 0) & (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1)
+
+
+def not_grown_beside(fitted: np.ndarray, before: np.ndarray, positions: np.ndarray, view: View) -> np.ndarray:
+    """Masses [N] after a fit, where only the edge of a particle is in the image at most what they were: a tail that is seen
+    says next to nothing of the whole, and to explain a pixel with it the whole would have to become huge."""
+    return np.where(is_in_image(positions, view), fitted, np.minimum(fitted, before))
+
+
 def take(record: AnyRecord, is_kept: np.ndarray) -> AnyRecord:
     """The record with some of its particles."""
     return dataclasses.replace(record, **{name: getattr(record, name)[is_kept] for name in _names(record)})

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from backend.fit.adam import Adam
+from backend.fit.population import not_grown_beside
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View
 from backend.render import splat as renderer
@@ -88,11 +89,12 @@ def refine(
         )
         log_masses = log_masses + adam["masses"].change(np.asarray(gradients.optical_masses) * np.exp(log_masses))
         colors = np.maximum(colors + adam["colors"].change(np.asarray(gradients.features, np.float64)), 0.0)
+    masses = not_grown_beside(np.exp(log_masses).astype(np.float32), record.optical_masses, carried, view)
     refined = replace(
         record,
         positions=positions,
         scales=scales.astype(np.float32),
-        optical_masses=np.exp(log_masses).astype(np.float32),
+        optical_masses=masses,
         colors=(colors if channels is None else colors @ channels).astype(np.float32),
     )
     return refined, loss

@@ -12,9 +12,10 @@ from backend.contract.cameras import Cameras
 from backend.contract.job import VisualConfig
 from backend.fit import depth_prior, explain, image_motion
 from backend.fit.appearance import Appearance
-from backend.fit.population import frame_mass, is_near_image, join, pixel_mass, take
+from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import make_scene, optical_depth
+from backend.fit.state import VisualRecord
 from backend.geometry.camera import View, view_at
 from backend.render import splat as renderer
 from backend.render.composite import composite
@@ -205,3 +206,32 @@ def test_who_is_near_the_image() -> None:
     view: View = view_at(cameras(), 0)
     points = np.array([[0.0, 0, 0], [5.5, 0, 0], [7.0, 0, 0], [0.0, -20.0, 0.0]])
     np.testing.assert_array_equal(is_near_image(points, view), [True, True, False, False])
+
+
+def test_what_only_borders_on_the_image_does_not_grow() -> None:
+    """A particle beside the image whose tail is the only one to reach a bright border pixel: explaining that pixel with it would
+    take a thousand times its mass. It keeps its mass; one that is in the image grows."""
+    view = View(width=40, height=40, fx=40.0, fy=40.0, cx=20.0, cy=20.0, camera_to_world=np.eye(4))
+    beside, inside = [5.6, 0.0, 10.0], [0.0, 0.0, 10.0]  # 2.4 px to the right of the image; its middle
+    layer = np.zeros((40, 40, 4), np.float32)
+    layer[18:23, 39] = layer[18:23, 18:23] = 0.5
+    record = VisualRecord(
+        positions=np.array([beside, inside]),
+        velocities=np.zeros((2, 3), np.float32),
+        scales=np.full(2, 0.25, np.float32),
+        optical_masses=np.full(2, 1e-3, np.float32),
+        colors=np.ones((2, 3), np.float32),
+        ids=np.arange(2),
+        born=np.zeros(2, np.int32),
+        next_id=np.asarray(2),
+    )
+    _, fitted = explain.fit_masses(
+        renderer.forward(as_gaussians(record), view), record.optical_masses, optical_depth(layer), iterations=12, consistency=0.0
+    )
+    assert fitted[0] > 100 * record.optical_masses[0]  # what would happen
+    kept = not_grown_beside(fitted, record.optical_masses, record.positions, view)
+    assert kept[0] == record.optical_masses[0]
+    assert kept[1] == fitted[1] > 10 * record.optical_masses[1]
+    refined, _ = refine(record, layer, view, iterations=20, reference_scale=0.25)
+    assert refined.optical_masses[0] <= record.optical_masses[0]
+    assert refined.optical_masses[1] > 1.5 * record.optical_masses[1]
