@@ -33,6 +33,7 @@ from backend.io.atomic import write_text
 from backend.prior.weights import weights_fingerprint
 from benchmarks.cost import CHECKOUT
 from benchmarks.reconstruction import DOCS, PACKAGES, SETS, UNTOUCHED, as_text, code_digest, machine, run_module, version
+from benchmarks.trade_front import totals
 from benchmarks.trade_plan import FRAMES, Sweep, Trial, compared, sweeps, with_donors
 
 SCENES = ("puff_front", "steady_plume")  # two of the three that presets are tuned on: a thin front and a thick plume
@@ -220,6 +221,7 @@ def compare_trivial(root: Path, scenes: Sequence[Path], frames: tuple[int, int])
 def gather(root: Path, swept: Sequence[Sweep]) -> dict[str, Any]:
     """All cells of a folder, on which machine, with which versions and settings."""
     cells = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((root / "cells").glob("*/*.json"))]
+    cells = [{**cell, **totals(cell["stages"])} for cell in cells]
     versions = {"wildsmoke": __version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
     plan = [
         {

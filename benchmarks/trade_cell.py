@@ -25,6 +25,7 @@ from backend.events_out import StopRequest
 from backend.io.atomic import write_text
 from backend.io.job_folder import JobFolder
 from backend.pipeline import run_job
+from benchmarks.trade_front import totals
 from benchmarks.trade_plan import AHEAD
 
 
@@ -87,13 +88,7 @@ def run_cell(order: dict[str, Any]) -> dict[str, Any]:
     from benchmarks.trade_score import score_window  # after the measurement: it is no part of the job
 
     scores = score_window(folder, scene, Path(order["pictures"]), scored=(trial["scored_from"], stop))
-    return {
-        "stages": stages,
-        "seconds": round(sum(stage["seconds"] for stage in stages.values()), 3),
-        "cpu_seconds": round(sum(stage["cpu_seconds"] for stage in stages.values()), 3),
-        "peak_gib": max(stage["peak_gib"] for stage in stages.values()),
-        "scores": scores,
-    }
+    return {"stages": stages, **totals(stages), "scores": scores}
 
 
 if __name__ == "__main__":

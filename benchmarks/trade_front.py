@@ -24,6 +24,14 @@ SMALLEST = {"unseen_db": 0.1, "input_smoke_db": 0.1, "density_correlation": 0.00
 DEVIATIONS = 2.0  # standard errors that count as noise
 
 
+def totals(stages: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Seconds, processor seconds and peak memory, GiB, of a job. Without its inspection: most of that is the timing of the
+    machine for the estimate, which a machine goes through once and keeps."""
+    counted = [stage for name, stage in stages.items() if name != "inspect"]
+    found = {key: round(sum(stage[key] for stage in counted), 3) for key in ("seconds", "cpu_seconds")}
+    return {**found, "peak_gib": max(stage["peak_gib"] for stage in stages.values())}
+
+
 def figures(cell: Cell) -> dict[str, float]:
     """The measures of a cell, and the logarithm of its cost."""
     scores = cell["scores"]
@@ -132,6 +140,7 @@ def growth(rows: Iterable[tuple[str, float, float]]) -> Growth | None:
     for scene, value, cost in rows:
         if value > 0.0 and cost > 0.0:
             groups.setdefault(scene, []).append((math.log(value), math.log(cost)))
+    groups = {scene: group for scene, group in groups.items() if len(group) > 1}
     centred = []
     for group in groups.values():
         x_mean, y_mean = (sum(column) / len(group) for column in zip(*group, strict=True))

@@ -10,6 +10,7 @@ afterwards they are what they were. Counted are
     voxels_filled       voxels that Gaussians are summed into
     voxels_written      values of VDB grids
 
+but for what the machine is timed with before an estimate: that is no part of a job, and done once on a machine.
 Instructions would say more, but processors count them only where the system lets one ask: not in most containers and virtual
 machines that tests run in; and to simulate them costs fifty times the time and knows no new vector instructions.
 """
@@ -28,6 +29,7 @@ import numpy as np
 from numba.core.registry import CPUDispatcher
 from torch.utils.flop_counter import FlopCounterMode
 
+from backend.estimate import machine
 from backend.io import vdb
 from backend.physics import neighbours
 from backend.physics.solver import Solver
@@ -45,15 +47,16 @@ KINDS: tuple[str, ...] = (
 
 
 class Tally:
-    """Counts by kind. Safe for several threads."""
+    """Counts by kind, unless it is paused. Safe for several threads."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = dict.fromkeys(KINDS, 0)
+        self.is_paused = False
         self._lock = threading.Lock()
 
     def add(self, kind: str, count: float) -> None:
         with self._lock:
-            self.counts[kind] += round(count)
+            self.counts[kind] += 0 if self.is_paused else round(count)
 
 
 @contextmanager
@@ -64,6 +67,8 @@ def counted() -> Iterator[dict[str, int]]:
         for function, kind, work in _functions():
             for module, name in _places(function):
                 stack.enter_context(mock.patch.object(module, name, _watched(function, tally, kind, work)))
+        for module, name in _places(machine.this_machine):
+            stack.enter_context(mock.patch.object(module, name, _uncounted(machine.this_machine, tally)))
         for method in (Solver.constrain, Solver.correct):
             watched = _before(method, tally, "neighbour_visits", lambda solver: solver.lists()[1].size)
             stack.enter_context(mock.patch.object(Solver, method.__name__, watched))
@@ -116,6 +121,18 @@ def _watched(function: Callable[..., Any], tally: Tally, kind: str, work: Callab
         result = function(*arguments, **options)
         tally.add(kind, work(result, *arguments, **options))
         return result
+
+    return watched
+
+
+def _uncounted(function: Callable[..., Any], tally: Tally) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def watched(*arguments: Any, **options: Any) -> Any:
+        tally.is_paused = True
+        try:
+            return function(*arguments, **options)
+        finally:
+            tally.is_paused = False
 
     return watched
 

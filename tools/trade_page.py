@@ -109,7 +109,8 @@ def how(results: Mapping[str, Any]) -> str:
         "Fitted from smoke on black with the true cameras, scored on few frames of each view. Short clips that begin in the "
         "middle of the smoke are harder than whole ones, so only differences count here.\n\n"
         "Costs are processor seconds on one thread: they depend less than the clock on what else a machine does. Work that "
-        "two jobs have in common was done once and counts for both. "
+        "two jobs have in common was done once and counts for both; the inspection is left out, because most of it is "
+        "the timing of the machine, which is done once. "
         f"Machine: {machine['processor']}, {machine['cores']} cores, {machine['memory_gib']:.0f} GiB, {machine['system']}, "
         f"not quiet (load average {min(loads):.1f} to {max(loads):.1f} at the starts), so that ratios say more than seconds. "
         f"{versions}; sources {codes}.\n\n"
@@ -183,12 +184,15 @@ def growths(results: Mapping[str, Any]) -> list[str]:
 
 
 def settings(results: Mapping[str, Any]) -> list[str]:
-    parts = ["Means over the scenes that a setting was measured on; `(base)` marks the preset's own value.\n"]
+    parts = ["Means over the scenes that all values of a setting were measured on; `(base)` marks the preset's own value.\n"]
     for sweep in results["sweeps"]:
         columns = COLUMNS | (EXPORT_COLUMNS if sweep["stage"] == "export" else {})
+        cells = {name: [cell for cell in results["cells"] if cell["name"] == name] for _, name in sweep["points"]}
+        scenes = [{cell["scene"] for cell in found} for found in cells.values() if found]
+        common = set.intersection(*scenes) if scenes else set()
         rows = []
         for value, name in sweep["points"]:
-            found = [cell for cell in results["cells"] if cell["name"] == name]
+            found = [cell for cell in cells[name] if cell["scene"] in common]
             if not found:
                 continue
             costs = [_mean([cell[key] for cell in found]) for key in ("cpu_seconds", "seconds")]

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from backend.contract.errors import BackendError
+from backend.estimate import machine
 from backend.io.particles import ParticleFrame
 from backend.physics import neighbours
 from backend.physics import solver as solvers
@@ -125,6 +126,14 @@ def test_drawing_and_filling_are_counted() -> None:
         voxelize.voxelize(frame, LATTICE)
         reach = 2.0 * voxelize.splat_extents(frame, LATTICE.voxel_size)[0] / LATTICE.voxel_size + 1.0
         assert counts["voxels_filled"] == round(float(reach.prod())) > 8
+
+
+def test_timing_the_machine_is_no_work_of_a_job(tmp_path: Path) -> None:
+    with work.counted() as counts:
+        found = machine.this_machine(["splat"], folder=tmp_path)
+        assert min(found.seconds.values()) > 0.0 and not any(counts.values())
+        neighbours.find_neighbours(np.zeros((2, 3)), 1.0)
+        assert counts["neighbour_visits"] == 2, "it goes on behind"
 
 
 def test_the_backend_is_left_as_it_was() -> None:
