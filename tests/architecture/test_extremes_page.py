@@ -8,7 +8,7 @@ import math
 from tools import extremes_page
 
 
-def tests_with_lines() -> set[str]:
+def functions_with_lines() -> set[str]:
     """FILE::TEST of every test of the suite that takes the table."""
     found = set()
     for path in extremes_page.SUITE.glob("test_*.py"):
@@ -28,7 +28,7 @@ def test_the_whole_ranges_were_run() -> None:
 
 
 def test_every_line_has_its_test_and_every_test_its_line() -> None:
-    assert {row["test"].partition("[")[0] for row in extremes_page.load()["rows"]} == tests_with_lines()
+    assert {row["test"].partition("[")[0] for row in extremes_page.load()["rows"]} == functions_with_lines()
 
 
 def test_no_line_is_beyond_its_bound_or_without_a_part() -> None:
