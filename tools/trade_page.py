@@ -134,16 +134,22 @@ def presets(points: Mapping[str, Point], noise: Mapping[str, float]) -> list[str
         costs = {stage: _mean_stage(point, stage) for stage in stages}
         dearest = ", ".join(f"{stage} {costs[stage]:.0f}" for stage in sorted(costs, key=lambda stage: -costs[stage])[:3])
         peak = max(cell["peak_gib"] for cell in point.cells.values())
-        better = dominating(point, points.values(), noise)
+        better = dominating(point, rivals(name, points), noise)
         measures = [f"{point.mean(name):{'.3f' if 'correlation' in name else '.2f'}}" for name in MEASURES]
         verdict = "yes" if not better else f"no: {setting(better[0].name)}"
         rows.append([name, f"{point.cost:.0f}", dearest, f"{peak:.2f}", *measures, verdict])
     head = ["preset", "processor s", "of these", "peak GiB", *TITLES.values(), "on the front"]
     words = (
         "A preset is off the front where something that was measured is nowhere worse and somewhere better, both by more than "
-        "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, in density.\n"
+        "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, in density. Settings stand as they are here; that a preset lets the clip decide some of them "
+        "(`follow_clip=true`) makes it no other preset.\n"
     )
     return [table(head, rows), words]
+
+
+def rivals(preset: str, points: Mapping[str, Point]) -> list[Point]:
+    """What a preset is compared with: all but itself where it lets the clip decide, which is the same preset."""
+    return [point for name, point in points.items() if name != f"{preset} follow_clip=true"]
 
 
 def trivial(found: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -67,7 +67,9 @@ def test_nothing_is_chosen_by_what_is_untouched_nor_compared_across_sources() ->
 def beaten(name: str) -> list[str]:
     found = results()
     points = trade_page.whole(found)
-    return [other.name for other in front.dominating(points[name], points.values(), front.noise_of(found["cells"]))]
+    return [
+        other.name for other in front.dominating(points[name], trade_page.rivals(name, points), front.noise_of(found["cells"]))
+    ]
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=WAITING.get(name, ())) for name in PRESETS])
@@ -116,6 +118,12 @@ def test_who_dominates(changed: dict[str, float], cost: float, expected: bool) -
     assert front.dominates(other, base, NOISE) is expected
     assert not front.dominates(base, base, NOISE)
     assert [found.name for found in front.dominating(base, [base, other], NOISE)] == (["draft x=1"] if expected else [])
+
+
+def test_a_preset_that_lets_the_clip_decide_is_no_rival_of_itself() -> None:
+    names = ("draft", "draft follow_clip=true", "preview follow_clip=true")
+    points = {name: point(name, cell(name)) for name in names}
+    assert [found.name for found in trade_page.rivals("draft", points)] == ["draft", "preview follow_clip=true"]
 
 
 def test_noise_takes_the_edge_off() -> None:
