@@ -141,7 +141,8 @@ def presets(points: Mapping[str, Point], noise: Mapping[str, float]) -> list[str
     head = ["preset", "processor s", "of these", "peak GiB", *TITLES.values(), "on the front"]
     words = (
         "A preset is off the front where something that was measured is nowhere worse and somewhere better, both by more than "
-        "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, in density. Settings stand as they are here; that a preset lets the clip decide some of them "
+        "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, "
+        "in density. Settings stand as they are here; that a preset lets the clip decide some of them "
         "(`follow_clip=true`) makes it no other preset.\n"
     )
     return [table(head, rows), words]
