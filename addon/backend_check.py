@@ -5,21 +5,20 @@ Nothing is ever installed from here, least of all into Blender's Python: the use
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..backend.contract.errors import BackendError
-from .job_runner import Backend, group_options, signal_group
+from .job_runner import Backend
+from .question import Question
 
 OLDEST_PYTHON = (3, 11)
 NEWEST_PYTHON = (3, 13)
@@ -152,74 +151,24 @@ def judge(report: Mapping[str, Any], requirements: Mapping[str, str], *, python:
     return Finding(is_usable=is_usable, lines=tuple(lines), commands=() if is_usable else commands)
 
 
-class BackendCheck:
-    """One check in a thread. poll() gives the finding once it is there; close() ends it early."""
+class BackendCheck(Question[Finding]):
+    """One check of a Python."""
 
     def __init__(self, python: str, root: Path, *, commands: tuple[str, ...], seconds: float = CHECK_SECONDS) -> None:
-        self._backend = Backend(python=python, root=root)
         self._commands = commands
-        self._seconds = seconds
-        self._process: subprocess.Popen[bytes] | None = None
-        self._finding: Finding | None = None
-        self._thread = threading.Thread(target=self._work, name="wildsmoke-check", daemon=True)
         self._requirements = read_requirements(root)
-        self._launch()
-
-    def _launch(self) -> None:
         names = {name: IMPORT_NAMES.get(name, name) for name in self._requirements}
-        try:
-            self._process = subprocess.Popen(
-                [self._backend.python, "-c", PROBE, json.dumps(names)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                cwd=self._backend.root,
-                env=self._backend.environment(),
-                **group_options(),
-            )
-        except OSError as error:
-            self._finding = self._failed(f"{self._backend.python} cannot be started: {error.strerror or error}")
-            return
-        self._thread.start()
+        probe = [python, "-c", PROBE, json.dumps(names)]
+        super().__init__(Backend(python=python, root=root), probe, seconds=seconds, read=self._judged, failed=self._unusable)
 
-    def _work(self) -> None:
-        process = self._process
-        assert process is not None
-        try:
-            output, errors = process.communicate(timeout=self._seconds)
-        except subprocess.TimeoutExpired:
-            signal_group(process, force=True)
-            process.communicate()
-            self._finding = self._failed(f"{self._backend.python} gave no answer within {self._seconds:.0f} s")
-            return
-        self._finding = self._read(output, errors)
-
-    def _read(self, output: bytes, errors: bytes) -> Finding:
+    def _judged(self, output: bytes, errors: bytes) -> Finding:
         answers = [line for line in output.decode(errors="replace").splitlines() if line.startswith(_MARK)]
         if not answers:
             words = errors.decode(errors="replace").strip().splitlines()
             said = f" It said: {words[-1]}" if words else ""
-            return self._failed(f"{self._backend.python} is no Python that can be used.{said}")
+            return self._unusable(f"{self._python} is no Python that can be used.{said}")
         report = json.loads(answers[-1].removeprefix(_MARK))
-        return judge(report, self._requirements, python=self._backend.python, commands=self._commands)
+        return judge(report, self._requirements, python=self._python, commands=self._commands)
 
-    def _failed(self, sentence: str) -> Finding:
+    def _unusable(self, sentence: str) -> Finding:
         return Finding(is_usable=False, lines=((False, sentence),), commands=self._commands)
-
-    def poll(self) -> Finding | None:
-        """The finding, None while the check is at work. Never waits."""
-        return self._finding
-
-    def wait(self) -> Finding:
-        """The finding, waited for: for Blender in background mode."""
-        if self._thread.is_alive():
-            self._thread.join()
-        assert self._finding is not None
-        return self._finding
-
-    def close(self) -> None:
-        """End the check."""
-        if self._process is not None and self._process.poll() is None:
-            signal_group(self._process, force=True)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)

@@ -40,7 +40,7 @@ from backend.score import measures
 from backend.score.particles import ParticlePrediction
 from backend.score.truth_set import read_truth_set
 from benchmarks.cost import CHECKOUT
-from benchmarks.reconstruction import SETS, UNTOUCHED, code_digest, machine, run_module
+from benchmarks.reconstruction import SETS, UNTOUCHED, as_text, code_digest, machine, run_module
 from benchmarks.trade_cell import Meter
 from benchmarks.trade_score import frames_of, true_pictures
 
@@ -291,13 +291,6 @@ def gather(root: Path, scenes: list[str], *, preset: str, frames: tuple[int, int
     threads = int(os.environ.get("NUMBA_NUM_THREADS", len(os.sched_getaffinity(0))))
     variants = [{**asdict(variant), "base": variant.base} for variant in VARIANTS]
     return {"machine": machine(), "threads": threads, "preset": preset, "frames": frames, "variants": variants, "cells": cells}
-
-
-def as_text(results: dict[str, Any]) -> str:
-    """JSON with a line for each cell."""
-    head = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in results.items() if name != "cells")
-    rows = ",\n".join(json.dumps(cell, allow_nan=False) for cell in results["cells"])
-    return f'{{\n{head},\n"cells": [\n{rows}\n]\n}}\n'
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ from backend.pipeline import run_job
 from backend.reporting import SilentReport
 from backend.stages import inspect
 from benchmarks.cost import CHECKOUT
-from benchmarks.reconstruction import SETS, machine, run_module
+from benchmarks.reconstruction import SETS, as_text, machine, run_module
 from benchmarks.trade_cell import Meter
 
 RESULTS = CHECKOUT / "docs" / "results" / "estimates.json"
@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
     if given.fit:
         write_text(COSTS_FILE, json.dumps(fitted([record for record in records if record["is_fitted"]]), indent=1) + "\n")
     costs = json.loads(COSTS_FILE.read_text(encoding="utf-8"))
-    text = as_text({"machine": machine(), "factor": FACTOR, "pairs": [pair_of(record, costs) for record in records]})
+    text = as_text({"machine": machine(), "factor": FACTOR, "pairs": [pair_of(record, costs) for record in records]}, "pairs")
     for path in (given.json, RESULTS if given.page else None):
         if path is not None:
             write_text(path, text)
@@ -236,13 +236,6 @@ def pair_of(record: dict[str, Any], costs: dict[str, Any]) -> dict[str, Any]:
         "estimated_stages": {name: round(value, 2) for name, value in estimated.items()},
         "measured_stages": record["stages"],
     }
-
-
-def as_text(results: dict[str, Any]) -> str:
-    """JSON with a line for each pair."""
-    head = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in results.items() if name != "pairs")
-    rows = ",\n".join(json.dumps(pair, allow_nan=False) for pair in results["pairs"])
-    return f'{{\n{head},\n"pairs": [\n{rows}\n]\n}}\n'
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -210,17 +210,11 @@ def without_frames(found: Any) -> Any:
     return {name: without_frames(value) for name, value in found.items() if not name.startswith("by_frame_")}
 
 
-def as_text(results: dict[str, Any]) -> str:
-    """JSON with a line for each cell, so that a cell that changes changes a line."""
-
-    def lines() -> Iterator[str]:
-        for name, value in results.items():
-            if name != "cells":
-                yield f"{json.dumps(name)}: {json.dumps(value)}"
-        rows = ",\n".join(json.dumps(cell, allow_nan=False) for cell in results["cells"])
-        yield f'"cells": [\n{rows}\n]'
-
-    return "{\n" + ",\n".join(lines()) + "\n}\n"
+def as_text(results: dict[str, Any], rows: str = "cells") -> str:
+    """JSON with a line for each of its rows, which come last, so that one that changes changes a line."""
+    head = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in results.items() if name != rows)
+    lines = ",\n".join(json.dumps(row, allow_nan=False) for row in results[rows])
+    return f"{{\n{head},\n{json.dumps(rows)}: [\n{lines}\n]\n}}\n"
 
 
 def summary(cell: dict[str, Any]) -> dict[str, Any]:
