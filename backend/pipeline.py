@@ -235,7 +235,8 @@ class Pipeline:
         from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
         from backend.stages import volume
 
-        return volume.run(layers, cameras, report, prior=Prior(self.weights), done=done, stride=self.config.volume.stride)
+        settings, prior = self.config.volume, Prior(self.weights)
+        return volume.run(layers, cameras, report, prior=prior, done=done, stride=settings.stride, every=settings.every)
 
     def _volumes(self) -> AbstractContextManager[RecordFile[VolumeRecord] | None]:
         """What the prior proposes, open for reading; None where it is not asked."""

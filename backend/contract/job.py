@@ -103,12 +103,15 @@ class VolumeConfig:
 
     use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
     stride: frames between the images that it compares; 0 finds it from the motion.
+    every: at every such frame it is asked; what lies between is carried along its velocity.
     """
 
     use_prior: bool = True
     stride: int = 0
+    every: int = 1
 
     def __post_init__(self) -> None:
+        _check("every", self.every, 1, 16)
         _check("stride", self.stride, 0, 60)
 
 

@@ -60,9 +60,10 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
         "smoke": [Term(name="write", kind="pixels", amount=count * pixels)],
     }
     if asks_prior(config):
+        asked = -(-count // config.volume.every)
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),
-            Term(name="propose", kind="network", amount=count / max(1, min(threads, 8))),
+            Term(name="propose", kind="network", amount=asked / max(1, min(threads, 8))),
         ]
     terms["physical"] = _physical(seen, config, pixels)
     terms["visual"] = _visual(seen, config, pixels, visual)

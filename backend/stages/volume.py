@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from backend.contract.cameras import Cameras
+from backend.fit.between import between
 from backend.fit.pace import stride_of
 from backend.fit.region import find_region
 from backend.fit.scene import make_scene
@@ -17,7 +18,8 @@ from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
 from backend.geometry.upright import turned, up_of, upright
-from backend.prior.predict import Prior, Proposal, one_thread
+from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
+from backend.prior.window import stand_before
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
@@ -31,6 +33,7 @@ def run(
     prior: Prior,
     done: Series[VolumeRecord],
     stride: int = 0,  # frames between the images that are compared; 0: found from the motion
+    every: int = 1,  # the prior is asked at every such frame; those between come from the two around them
     num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
     """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
@@ -59,6 +62,12 @@ def run(
             seconds_per_frame=scene.seconds_per_frame,
         )
 
+    def amid(before: tuple[int, Proposal], after: tuple[int, Proposal], frame: int) -> Proposal:
+        count = after[0] - before[0]
+        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size, shape=SHAPE)
+        share = (frame - before[0]) / count
+        return between(before[1], after[1], stand, share=share, seconds=count * scene.seconds_per_frame)
+
     def recorded(proposal: Proposal, frame: int) -> VolumeRecord:
         density = agreed(sharpened(proposal.density), proposal.stand, region.depths[frame], region.views[frame])
         density, density_unit = _halved(density)
@@ -72,14 +81,26 @@ def run(
             velocity_unit=velocity_unit,
         )
 
+    last = len(layers) - 1
+    if len(done) > last:
+        return
+    asked = [*range(len(done) // every * every, last, every), last]
     at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
+    frame, before = len(done), None
     with ThreadPoolExecutor(at_once) as pool:
-        for first in range(len(done), len(layers), at_once):
-            report.progress(first, len(layers))
+        for first in range(0, len(asked), at_once):
+            report.progress(frame, len(layers))
+            part = asked[first : first + at_once]
             with one_thread():
-                proposals = list(pool.map(proposed, range(first, min(first + at_once, len(layers)))))
-            for frame, proposal in enumerate(proposals, start=first):
-                yield recorded(proposal, frame)
+                answers = list(pool.map(proposed, part))
+            for place, answer in zip(part, answers, strict=True):
+                while frame < place and before is not None:
+                    yield recorded(amid(before, (place, answer), frame), frame)
+                    frame += 1
+                if frame == place:
+                    yield recorded(answer, frame)
+                    frame += 1
+                before = place, answer
     report.progress(len(layers), len(layers))
 
 

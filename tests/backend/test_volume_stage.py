@@ -12,12 +12,15 @@ import pytest
 import torch
 
 from backend.field.rays import optical_depth
+from backend.fit.between import between
 from backend.fit.guide import Guide
 from backend.fit.scene import make_scene, turned_about
 from backend.fit.sharpen import sharpened
+from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.network import PlumeNet
-from backend.prior.predict import Prior, save_weights
+from backend.prior.predict import SHAPE, Prior, Proposal, save_weights
+from backend.prior.window import Stand, stand_before
 from backend.reporting import SilentReport
 from backend.stages import volume
 from benchmarks.tilted_scene import tilted, turn
@@ -68,14 +71,43 @@ def test_a_tilted_world_gets_the_same_answer_tilted(prior: Prior) -> None:
         np.testing.assert_allclose(found.velocity_at(moved), wanted.velocity_at(points) @ tilt[:3, :3].T, atol=0.05)
 
 
-def test_it_goes_on_behind_what_is_done(prior: Prior) -> None:
-    whole = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2))
-    rest = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=whole[:4], stride=2))
+@pytest.mark.parametrize(("every", "num_done"), [(1, 4), (2, 3), (3, 4), (3, 6), (16, 1)])
+def test_it_goes_on_behind_what_is_done(prior: Prior, every: int, num_done: int) -> None:
+    whole = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, every=every))
+    rest = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=whole[:num_done], stride=2, every=every))
     assert len(whole) == NUM_FRAMES
-    assert len(rest) == 2
-    for a, b in zip(whole[4:], rest, strict=True):
+    assert len(rest) == NUM_FRAMES - num_done
+    for a, b in zip(whole[num_done:], rest, strict=True):
         assert a.density.tobytes() == b.density.tobytes()
         assert a.velocity.tobytes() == b.velocity.tobytes()
+
+
+def test_frames_that_were_asked_are_not_changed_by_those_between(prior: Prior) -> None:
+    all_asked = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2))
+    few_asked = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, every=2))
+    same = [a.density.tobytes() == b.density.tobytes() for a, b in zip(all_asked, few_asked, strict=True)]
+    assert same == [True, False, True, False, True, True]
+
+
+def test_smoke_between_two_frames_is_where_it_was_on_its_way() -> None:
+    view = view_at(CAMERAS, 0)
+    stands = [stand_before(view, np.array([shift, 0.0, 8.0]), voxel_size=0.4, shape=SHAPE) for shift in (0.0, 0.3, -0.2)]
+    velocity = np.array([2.0, -1.0, 3.0])
+
+    def puff(stand: Stand, seconds: float) -> Proposal:
+        points = (stand.lattice.centres() - stand.from_world[:3, 3]) @ stand.from_world[:3, :3]
+        density = np.exp(-np.square(points - (np.array([0.1, 0.2, 7.5]) + seconds * velocity)).sum(axis=-1))
+        return Proposal(
+            stand=stand,
+            density=density.astype(np.float32),
+            velocity=np.broadcast_to(velocity, (*density.shape, 3)).astype(np.float32),
+        )
+
+    found = between(puff(stands[0], 0.0), puff(stands[1], 0.4), stands[2], share=0.25, seconds=0.4)
+    wanted = puff(stands[2], 0.1)
+    np.testing.assert_allclose(found.velocity, wanted.velocity, atol=1e-5)
+    assert np.abs(found.density - wanted.density).max() < 0.06  # two trilinear lookups
+    assert np.abs(puff(stands[2], 0.0).density - wanted.density).max() > 0.2
 
 
 def test_a_clip_without_smoke_has_no_volumes(prior: Prior) -> None:
@@ -84,10 +116,15 @@ def test_a_clip_without_smoke_has_no_volumes(prior: Prior) -> None:
 
 
 @pytest.mark.parametrize("num_workers", [2, 3, 50])
-def test_frames_at_once_have_the_same_bytes_and_order(prior: Prior, num_workers: int) -> None:
+@pytest.mark.parametrize("every", [1, 2])
+def test_frames_at_once_have_the_same_bytes_and_order(prior: Prior, num_workers: int, every: int) -> None:
     threads = torch.get_num_threads()
-    alone = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, num_workers=1))
-    beside = list(volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, num_workers=num_workers))
+
+    def made(count: int) -> list[VolumeRecord]:
+        rows = volume.run(layers(), CAMERAS, SilentReport(), prior=prior, done=[], stride=2, every=every, num_workers=count)
+        return list(rows)
+
+    alone, beside = made(1), made(num_workers)
     assert len(beside) == NUM_FRAMES
     for a, b in zip(alone, beside, strict=True):
         assert all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in ("density", "velocity", "from_world"))
