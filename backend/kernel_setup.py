@@ -21,7 +21,10 @@ def settle() -> None:
     # Threads that wait must sleep, not spin: beside another busy program (Blender, say) spinning made each kernel ten
     # times slower. libgomp reads this when it loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # The same holds for products of many points with a small matrix; and one thread gives the same bytes everywhere.
+    # Where a TBB lies about, as in Blender's own Python, numba would take it; on one processor it then waits for ever when
+    # the program ends (https://github.com/numba/numba/issues/10556).
+    os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
+    # Threads of products of many points with a small matrix spin, too; and one thread gives the same bytes everywhere.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numba looks only at the file of a kernel, not at what it inlines from others: after an update it would go on
     # with stale machine code. So each version of all the kernels' sources has a folder of its own.

@@ -13,12 +13,13 @@ import pytest
 from backend import kernel_setup
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-PROBE = "import backend.render.splat, os, numba; print(os.environ['OMP_WAIT_POLICY'], numba.config.CACHE_DIR)"
+PROBE = "import backend.render.splat, os, numba; print(os.environ['OMP_WAIT_POLICY'], numba.config.CACHE_DIR, \
+numba.config.THREADING_LAYER_PRIORITY[0])"
 
 
 def probe(**changes: str) -> list[str]:
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **changes}
-    for name in ("OMP_WAIT_POLICY", "NUMBA_CACHE_DIR"):
+    for name in ("OMP_WAIT_POLICY", "NUMBA_CACHE_DIR", "NUMBA_THREADING_LAYER_PRIORITY"):
         if name not in changes:
             environment.pop(name, None)
     return subprocess.run(
@@ -27,13 +28,15 @@ def probe(**changes: str) -> list[str]:
 
 
 def test_settled_before_numba_reads_it(tmp_path: Path) -> None:
-    policy, folder = probe(XDG_CACHE_HOME=str(tmp_path))
+    policy, folder, threads_by = probe(XDG_CACHE_HOME=str(tmp_path))
     assert policy == "passive"
+    assert threads_by == "omp"
     assert folder.endswith(f"wildsmoke/kernels-{kernel_setup.sources_fingerprint()}")
 
 
 def test_the_users_own_settings_stand(tmp_path: Path) -> None:
-    assert probe(OMP_WAIT_POLICY="active", NUMBA_CACHE_DIR=str(tmp_path)) == ["active", str(tmp_path)]
+    own = {"OMP_WAIT_POLICY": "active", "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_THREADING_LAYER_PRIORITY": "workqueue omp tbb"}
+    assert probe(**own) == ["active", str(tmp_path), "workqueue"]
 
 
 def test_another_source_is_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
