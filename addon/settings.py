@@ -36,7 +36,7 @@ class WILDSMOKE_PG_frames(bpy.types.PropertyGroup):
     working_size: IntProperty(
         name="Size (px)",
         description="Longest side of the frames that are fitted; larger ones are reduced",
-        default=320,
+        default=256,
         min=16,
         max=8192,
         soft_max=1024,
@@ -124,6 +124,13 @@ class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
         min=0,
         max=60,
     )
+    every: IntProperty(
+        name="Every",
+        description="Frames from one that it is asked about to the next, at most a stride; between, smoke is carried along",
+        default=5,
+        min=1,
+        max=16,
+    )
 
 
 class WILDSMOKE_PG_physical(bpy.types.PropertyGroup):
@@ -168,7 +175,7 @@ class WILDSMOKE_PG_visual(bpy.types.PropertyGroup):
     mass_iterations: IntProperty(
         name="Mass Iterations",
         description="Multiplicative updates of the optical masses in each frame",
-        default=8,
+        default=2,
         min=1,
         max=1000,
     )

@@ -44,7 +44,7 @@ class FramesConfig:
     frame_rate: frames per second; 0 takes it from the file (image sequences: 24).
     """
 
-    working_size: int = 320
+    working_size: int = 256
     frame_rate: float = 0.0
 
     def __post_init__(self) -> None:
@@ -103,12 +103,12 @@ class VolumeConfig:
 
     use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
     stride: frames between the images that it compares; 0 finds it from the motion.
-    every: at every such frame it is asked; what lies between is carried along its velocity.
+    every: frames from one that it is asked about to the next, at most a stride; what lies between is carried along.
     """
 
     use_prior: bool = True
     stride: int = 0
-    every: int = 1
+    every: int = 5
 
     def __post_init__(self) -> None:
         _check("every", self.every, 1, 16)
@@ -154,7 +154,7 @@ class VisualConfig:
 
     num_particles: int = 6000
     iterations: int = 6
-    mass_iterations: int = 8
+    mass_iterations: int = 2
     consistency: float = 0.1
     color: str = "auto"
 
@@ -257,9 +257,9 @@ class Config:
 def draft() -> Config:
     """A first look."""
     return Config(
-        frames=FramesConfig(working_size=256),
+        frames=FramesConfig(working_size=192),
         physical=PhysicalConfig(num_particles=1000, solver_iterations=2, correction_iterations=2),
-        visual=VisualConfig(num_particles=4000, iterations=3, mass_iterations=6),
+        visual=VisualConfig(num_particles=4000, iterations=3),
         published=PublishedConfig(num_physical=1000, num_particles=4000, physical_iterations=6, visual_iterations=6),
         export=ExportConfig(max_voxels=128),
     )
@@ -275,7 +275,7 @@ def final() -> Config:
     return Config(
         frames=FramesConfig(working_size=480),
         physical=PhysicalConfig(num_particles=4000, solver_iterations=4, correction_iterations=8),
-        visual=VisualConfig(num_particles=24000, iterations=16, mass_iterations=12),
+        visual=VisualConfig(num_particles=24000, iterations=16),
         published=PublishedConfig(num_physical=4000, num_particles=24000, physical_iterations=30, visual_iterations=30),
         export=ExportConfig(max_voxels=384),
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from backend.contract.job import Config
 from backend.estimate.machine import HEIGHT, NUM_PARTICLES, WIDTH
+from backend.fit.pace import longest_stride
 from backend.fit.survey import Survey
 
 ONE_HUE_SHARE = 0.65  # of the time that three channels take to be drawn and differentiated
@@ -60,10 +61,11 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
         "smoke": [Term(name="write", kind="pixels", amount=count * pixels)],
     }
     if asks_prior(config):
-        asked = -(-count // config.volume.every)
+        asked = -(-count // min(config.volume.every, longest_stride(count)))
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),
             Term(name="propose", kind="network", amount=asked / max(1, min(threads, 8))),
+            Term(name="frame", kind="pixels", amount=float(count)),
         ]
     terms["physical"] = _physical(seen, config, pixels)
     terms["visual"] = _visual(seen, config, pixels, visual)
@@ -86,16 +88,18 @@ def _physical(seen: Survey, config: Config, pixels: float) -> list[Term]:
         drawn = count * config.published.physical_iterations
         return [Term(name="published", kind="splat", amount=drawn * (particles + pixels))]
     particles = config.physical.num_particles / NUM_PARTICLES
-    way = "led" if asks_prior(config) else "filtered"
-    terms = [
-        Term(name=f"{way}_pixel", kind="pixels", amount=count * pixels),
-        Term(name=f"{way}_particle", kind="splat", amount=count * particles),
+    if asks_prior(config):
+        return [
+            Term(name="led_frame", kind="pixels", amount=float(count)),
+            Term(name="led_particle", kind="splat", amount=count * particles),
+        ]
+    drawn = count * config.physical.correction_iterations
+    return [
+        Term(name="filtered_pixel", kind="pixels", amount=count * pixels),
+        Term(name="filtered_particle", kind="splat", amount=count * particles),
+        Term(name="correction", kind="splat", amount=drawn * (particles + seen.smoke_share * pixels)),
+        Term(name="solver", kind="splat", amount=count * config.physical.solver_iterations * particles),
     ]
-    if way == "filtered":
-        drawn = count * config.physical.correction_iterations
-        terms.append(Term(name="correction", kind="splat", amount=drawn * (particles + seen.smoke_share * pixels)))
-        terms.append(Term(name="solver", kind="splat", amount=count * config.physical.solver_iterations * particles))
-    return terms
 
 
 def _visual(seen: Survey, config: Config, pixels: float, particles: float) -> list[Term]:

@@ -10,16 +10,21 @@ from backend.fit.region import Region
 _PAIRS = 12  # of frames that are looked at
 _CLEAR = 0.7  # px that smoke should move between two frames for its motion to be told
 _LONGEST = 16  # frames between them
+_STRIDES = 8  # at least, in a clip
 _STEP = 0.9  # voxels that smoke should move in a stride
 
 
 def stride_of(region: Region) -> int:
     """Frames in which smoke moves about one voxel; 1 where nothing moves or everything is too fast."""
-    count = len(region.depths)
     metres = _metres_a_frame(region)
     if metres <= 0.0:
         return 1
-    return int(np.clip(round(_STEP * region.voxel_size / metres), 1, max(1, count // 8)))
+    return int(np.clip(round(_STEP * region.voxel_size / metres), 1, longest_stride(len(region.depths))))
+
+
+def longest_stride(num_frames: int) -> int:
+    """Of a clip, in frames."""
+    return max(1, num_frames // _STRIDES)
 
 
 def _metres_a_frame(region: Region) -> float:

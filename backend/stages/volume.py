@@ -33,7 +33,7 @@ def run(
     prior: Prior,
     done: Series[VolumeRecord],
     stride: int = 0,  # frames between the images that are compared; 0: found from the motion
-    every: int = 1,  # the prior is asked at every such frame; those between come from the two around them
+    every: int = 1,  # frames, at most a stride: the prior is asked so often; what lies between comes from both sides
     num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
     """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
@@ -48,6 +48,7 @@ def run(
     if region is None:
         return
     stride = stride or stride_of(region)
+    every = min(every, stride)
 
     def proposed(frame: int) -> Proposal:
         return prior.propose(

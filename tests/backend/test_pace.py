@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from backend.fit.pace import stride_of
+from backend.fit.pace import longest_stride, stride_of
 from backend.fit.region import Region
 from backend.geometry.camera import View, view_at
 from synthetic.sweep import Orbit, orbit_cameras
@@ -42,3 +42,8 @@ def test_what_stands_or_is_not_there_has_the_shortest_stride() -> None:
     assert stride_of(empty) == 1
     one = Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=np.ones((1, 100, 60), np.float32), views=still[:1])
     assert stride_of(one) == 1
+
+
+@pytest.mark.parametrize(("num_frames", "longest"), [(1, 1), (15, 1), (120, 15)])
+def test_a_clip_holds_some_strides(num_frames: int, longest: int) -> None:
+    assert longest_stride(num_frames) == longest
