@@ -66,9 +66,7 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
 
 def truth(plume: Plume, moment: int, stand: Stand) -> tuple[np.ndarray, np.ndarray]:
     """Density [X, Y, Z] 1/m and velocity [X, Y, Z, 3] m/s of a plume on the grid, along its axes."""
-    rotation, offset = stand.from_world[:3, :3].T, -stand.from_world[:3, :3].T @ stand.from_world[:3, 3]
-    places = stand.lattice.centres() @ rotation.T + offset
-    at = np.moveaxis((places - plume.origin) / VOXEL_SIZE, -1, 0)
+    at = np.moveaxis((stand.centres() - plume.origin) / VOXEL_SIZE, -1, 0)
     density, velocity = plume.density_at(moment), plume.velocity_at(moment)
     found = [ndimage.map_coordinates(velocity[..., axis], at, order=1, mode="nearest") for axis in range(3)]
     return (

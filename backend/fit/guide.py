@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from backend.fit.depth_prior import MAX_SIDE, DepthPrior
 from backend.fit.state import VolumeRecord
@@ -33,12 +32,11 @@ class Guide:
 
     def density_at(self, points: np.ndarray) -> np.ndarray:
         """[N] 1/m; zero outside the grid."""
-        return _looked_up(self.density, self.places(points), "constant")
+        return self.stand.at(self.density, points, outside="constant")
 
     def velocity_at(self, points: np.ndarray) -> np.ndarray:
         """[N, 3] m/s; outside the grid that of its nearest voxel."""
-        at = self.places(points)
-        return np.stack([_looked_up(self.velocity[..., axis], at, "nearest") for axis in range(3)], axis=1)
+        return self.stand.at(self.velocity, points, outside="nearest")
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """[3, N] voxels from the first one's centre."""
@@ -86,7 +84,3 @@ class Guide:
         """Positions [N, 3] m one frame later: Heun's rule between the velocities of both frames."""
         first = self.velocity_at(positions)
         return positions + 0.5 * seconds * (first + next_guide.velocity_at(positions + seconds * first))
-
-
-def _looked_up(values: np.ndarray, places: np.ndarray, mode: str) -> np.ndarray:
-    return ndimage.map_coordinates(values, places, order=1, mode=mode)

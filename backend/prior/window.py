@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage
 
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -48,6 +49,23 @@ class Stand:
         """World points [..., 3] m -> [..., 3] voxels from the first one's centre."""
         local = points @ self.from_world[:3, :3].T + self.from_world[:3, 3]
         return (local - np.asarray(self.lattice.origin)) / self.lattice.voxel_size
+
+    def centres(self) -> np.ndarray:
+        """[X, Y, Z, 3] m: the voxels' centres in the world."""
+        return (self.lattice.centres() - self.from_world[:3, 3]) @ self.from_world[:3, :3]
+
+    def at(self, values: np.ndarray, points: np.ndarray, *, outside: str) -> np.ndarray:
+        """Values of the voxels, [X, Y, Z] or [X, Y, Z, C], at world points [N, 3] m, trilinear -> [N] or [N, C].
+
+        outside: "constant" for zero, "nearest" for the nearest voxel's.
+        """
+        places = self.voxels(points).T
+        if values.ndim == 3:
+            return ndimage.map_coordinates(values, places, order=1, mode=outside)
+        channels = [
+            ndimage.map_coordinates(values[..., index], places, order=1, mode=outside) for index in range(values.shape[3])
+        ]
+        return np.stack(channels, axis=1)
 
     def matrix(self, view: View) -> np.ndarray:
         """[3, 4]: voxel indices to homogeneous pixels of a view, the first pixel's centre at 0."""
