@@ -1,4 +1,4 @@
-"""The pipeline: alone knows the order of the stages, alone reads and writes their files, resumes and stops.
+"""The pipeline: alone knows the order of the stages, keeps and resumes their files, and stops.
 
 video -> decisions -> frames -> smoke layer -> cameras -> (volumes) -> physical -> visual particles -> forecast -> export
 """
@@ -17,30 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from backend import __version__
+from backend.asset import Asset
 from backend.contract import events, running
 from backend.contract.cameras import Cameras, read_cameras
 from backend.contract.decisions import DECISIONS_FILE, read_decisions
 from backend.contract.errors import BackendError
 from backend.contract.estimates import ESTIMATE_FILE, kept_estimate
 from backend.contract.job import Config, Job, read_job
-from backend.contract.light import Light
-from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result, read_result
+from backend.contract.result import PARTICLES_FILE, VDB_FOLDER, Result, read_result
 from backend.estimate.predict import estimate
 from backend.estimate.time_left import TimeLeft
 from backend.estimate.work import asks_prior
 from backend.events_out import EventSink, StageReport, StopRequest
-from backend.fit import light
-from backend.fit.lift import buoyancy_of, wind_of
-from backend.fit.series import Series
-from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
-from backend.geometry.camera import view_at
+from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
 from backend.io import images
 from backend.io.atomic import storage_errors, whole_file, write_text
 from backend.io.frame_stack import FrameStack, FrameStackWriter
 from backend.io.hdf5_file import whole_hdf5
 from backend.io.job_folder import JobFolder, file_fingerprint, fingerprint
-from backend.io.particles import Particles, ParticlesInfo, ParticlesWriter, read_particles
+from backend.io.particles import read_particles
 from backend.io.records import RecordFile, RecordFolder, open_stage_file, read_stamp, stamp, write_records
 from backend.io.video import Clip, open_clip
 from backend.prior.weights import WEIGHTS, weights_fingerprint
@@ -309,7 +304,8 @@ class Pipeline:
         mark = fingerprint("export", self.config.export, source, cameras_mark, visual_mark, forecast_mark)
 
         def write(report: StageReport) -> None:
-            self._write_particles(source, visual_mark, forecast_mark)
+            asset = Asset(folder=self.folder, preset=self.job.preset, config=self.config, weights_mark=self.weights_mark)
+            asset.write_particles(source, visual_mark, forecast_mark)
             self.sink.send(events.Artifact(kind="particles", path=PARTICLES_FILE))
             with read_particles(self.folder.particles) as particles:
                 plan = export.plan_export(particles, self.config.export, report)
@@ -317,63 +313,13 @@ class Pipeline:
                 frames_out = export.run(particles, self.config.export, report, plan=plan, existing=existing)
                 for frame, path in export.write_sequence(frames_out, self.folder.vdb):
                     self.sink.send(events.Artifact(kind="vdb", path=f"{VDB_FOLDER}/{path.name}", frame=frame))
-                result = self._result(particles, plan, mark)
+                warnings = [entry for entries in self._all_warnings().values() for entry in entries]
+                result = asset.result(particles, plan, mark, warnings=warnings)
             write_text(self.folder.result, result.to_json())
 
         found = _json_entry(self.folder.result, "fingerprint")
         self._stage("export", mark, found, write)
         return read_result(self.folder.path)
-
-    def _write_particles(self, source: str, visual_mark: str, forecast_mark: str) -> None:
-        """particles.h5 from the records of the fit and the forecast; left alone when it follows from them already."""
-        mark = fingerprint("particles", None, visual_mark, forecast_mark)
-        if _particles_fingerprint(self.folder.particles) == mark:
-            return
-        with (
-            RecordFile(self.folder.physical, PhysicalRecord) as fluid,
-            RecordFile(self.folder.visual, VisualRecord) as seen,
-            RecordFile(self.folder.forecast, VisualRecord) as ahead,
-            ParticlesWriter(self.folder.particles) as writer,
-        ):
-            for record in seen:
-                writer.append(particle_frame(record))
-            for record in ahead:
-                writer.append(particle_frame(record), is_forecast=True)
-            last = fluid[len(fluid) - 1]
-            buoyancy, doubt = buoyancy_of(last)
-            with open_stage_file(self.folder.smoke) as file:
-                frame_start = int(file.attrs["frame_start"])  # type: ignore[arg-type]
-            info = ParticlesInfo(
-                cameras=read_cameras(self.folder.cameras),
-                gravity=(0.0, 0.0, -9.81),
-                frame_start=frame_start,
-                buoyancy=_triple(buoyancy),
-                buoyancy_uncertainty=_triple(doubt),
-                fluid={
-                    "smoothing_length_m": float(last.smoothing_length),
-                    "rest_density": float(last.rest_density),
-                    **self._air(last),
-                },
-                light=self._light(seen),
-                provenance={
-                    "program": f"wildsmoke {__version__}",
-                    "source_fingerprint": source,
-                    "preset": self.job.preset,
-                    "settings": asdict(self.config),
-                    **({"prior_fingerprint": self.weights_mark} if self.weights_mark else {}),
-                    **self._doubt(seen[len(seen) - 1]),
-                },
-                fingerprint=mark,
-            )
-            writer.finish(info)
-
-    def _doubt(self, last: VisualRecord) -> dict[str, list[float]]:
-        """What the forecast says of its own uncertainty; nothing without one, and the published methods say nothing."""
-        config = self.config.forecast
-        if config.num_frames == 0 or self.config.method != "default":
-            return {}
-        seconds = 1.0 / read_cameras(self.folder.cameras).fps
-        return {"forecast_deviation_m": forecast.deviations(last, config, seconds=seconds)}
 
     def _prepare_sequence(self, mark: str) -> set[int]:
         """The frames of the VDB sequence that are there already; those of another export are removed first."""
@@ -384,50 +330,6 @@ class Pipeline:
             write_text(note, json.dumps({"fingerprint": mark}))
         paths = self.folder.vdb.glob("smoke_*.vdb")
         return {int(path.stem.rpartition("_")[2]) - 1 for path in paths}
-
-    def _result(self, particles: Particles, plan: export.ExportPlan, mark: str) -> Result:
-        warnings = [entry for entries in self._all_warnings().values() for entry in entries]
-        return Result(
-            particles=PARTICLES_FILE,
-            cameras=CAMERAS_FILE,
-            vdb_folder=VDB_FOLDER,
-            num_frames=particles.num_frames,
-            num_forecast=particles.num_forecast,
-            frame_start=particles.info.frame_start,
-            fps=particles.info.cameras.fps,
-            voxel_size=plan.voxel_size,
-            has_color=plan.has_color,
-            smoke_color=plan.smoke_color,
-            bounds=plan.bounds,
-            buoyancy=particles.info.buoyancy,
-            background_plate=self.folder.plate.name if self.folder.plate.is_file() else None,
-            light=particles.info.light,
-            warnings=warnings,
-            fingerprint=mark,
-        )
-
-    def _air(self, last: PhysicalRecord) -> dict[str, float]:
-        """What the air does in the method's fluid: drag, 1/s, everywhere or where smoke borders on air, and the learned wind."""
-        if self.config.method != "default":
-            return {"surface_drag_per_second": self.config.published.surface_drag}
-        drag = self.config.physical.drag
-        wind = wind_of(last, drag=drag)
-        return {"drag_per_second": drag} | {
-            f"wind_{axis}_m_per_second": float(speed) for axis, speed in zip("xyz", wind, strict=True)
-        }
-
-    def _light(self, seen: Series[VisualRecord]) -> Light | None:
-        """The clip's light, if its smoke shows one in a few frames of all parts of the clip."""
-        cameras = read_cameras(self.folder.cameras)
-        with open_stage_file(self.folder.smoke) as file:
-            layers = FrameStack(file, "smoke")
-            numbers = np.unique(np.linspace(len(seen) // 6, len(seen) - 1, light.NUM_FRAMES).astype(int)).tolist()
-            shots = []
-            for number in numbers:
-                layer = layers[number]
-                view = view_at(cameras, number, size=(layer.shape[1], layer.shape[0]))
-                shots.append(light.Shot(particles=particle_frame(seen[number]), view=view, layer=layer))
-        return light.find_light(shots)
 
     # -- bookkeeping ----------------------------------------------------------------------------------------------
 
@@ -485,17 +387,3 @@ def _json_entry(path: Path, name: str) -> Any:
     except (OSError, ValueError):
         return None
     return data.get(name) if isinstance(data, dict) else None
-
-
-def _particles_fingerprint(path: Path) -> str | None:
-    """What a particles.h5 follows from; None if there is none or it cannot be read (it is then made anew)."""
-    try:
-        with read_particles(path) as particles:
-            return particles.info.fingerprint
-    except BackendError:
-        return None
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
