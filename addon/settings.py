@@ -36,7 +36,7 @@ class WILDSMOKE_PG_frames(bpy.types.PropertyGroup):
     working_size: IntProperty(
         name="Size (px)",
         description="Longest side of the frames that are fitted; larger ones are reduced",
-        default=256,
+        default=192,
         min=16,
         max=8192,
         soft_max=1024,
@@ -175,7 +175,7 @@ class WILDSMOKE_PG_visual(bpy.types.PropertyGroup):
     mass_iterations: IntProperty(
         name="Mass Iterations",
         description="Multiplicative updates of the optical masses in each frame",
-        default=2,
+        default=1,
         min=1,
         max=1000,
     )

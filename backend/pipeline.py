@@ -214,24 +214,23 @@ class Pipeline:
         mark = fingerprint("volume", self.config.volume, self.weights_mark, smoke_mark, cameras_mark)
 
         def write(report: StageReport) -> None:
+            from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
+            from backend.stages import volume
+
+            settings = self.config.volume
             with open_stage_file(self.folder.smoke) as file:
                 layers, cameras = FrameStack(file, "smoke"), read_cameras(self.folder.cameras)
-                parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
-                _keep(parts, self._proposed(layers, cameras, report, parts))
-            write_records(self.folder.volume, mark, parts)
+                plan = volume.make_plan(layers, cameras, stride=settings.stride, every=settings.every)
+            parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
+            if plan is None:
+                write_records(self.folder.volume, mark, ())
+            else:
+                _keep(parts, volume.propose(plan, report, prior=Prior(self.weights), done=parts))
+                write_records(self.folder.volume, mark, volume.run(plan, report, parts))
             parts.remove()
 
         self._stage("volume", mark, read_stamp(self.folder.volume), write)
         return (mark,)
-
-    def _proposed(
-        self, layers: FrameStack, cameras: Cameras, report: StageReport, done: RecordFolder[VolumeRecord]
-    ) -> Iterator[VolumeRecord]:
-        from backend.prior.predict import Prior  # torch: two seconds that other jobs need not wait
-        from backend.stages import volume
-
-        settings, prior = self.config.volume, Prior(self.weights)
-        return volume.run(layers, cameras, report, prior=prior, done=done, stride=settings.stride, every=settings.every)
 
     def _volumes(self) -> AbstractContextManager[RecordFile[VolumeRecord] | None]:
         """What the prior proposes, open for reading; None where it is not asked."""

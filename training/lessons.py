@@ -1,6 +1,7 @@
 """Lessons on disk, drawn from a library of plumes, a file for each plume:
 
-DIR/0001.npz   depths [N, O, X, Y, Z], conditions [N, C], source [N, 3], density [N, X, Y, Z], velocity [N, 3, X, Y, Z]; float16
+DIR/0001.npz   images [N, O, h, w], matrices [N, O, 3, 4], strides [N, O], conditions [N, C], source [N, 3], sizes [N, 2],
+               density [N, X, Y, Z], velocity [N, 3, X, Y, Z]; float16, matrices float32
 
 .venv/backend/bin/python -m training.lessons --plumes DIR --out DIR --seeds 0:120 [--each 50]
 """
@@ -36,6 +37,7 @@ def write_lessons(plume: Path, target: Path, *, seed: int, count: int) -> None:
             break
     names = ("images", "matrices", "strides", "conditions", "source")
     arrays = {name: np.stack([getattr(lesson.window, name) for lesson in drawn]) for name in names}
+    arrays["sizes"] = np.stack([lesson.size for lesson in drawn])
     arrays["density"] = np.stack([lesson.density for lesson in drawn])
     arrays["velocity"] = np.stack([np.moveaxis(lesson.velocity, -1, 0) for lesson in drawn])
     with whole_file(target) as part, open(part, "wb") as file:

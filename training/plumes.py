@@ -13,6 +13,7 @@ from synthetic.scenes import Obstacle, SmokeScene, Source
 
 SIZE = (12.0, 12.0, 20.0)  # m
 _LOWEST, _HIGHEST = 0.6, 2.4  # m, of a source
+_WINDIER = 200  # from this number on
 _REACH = 1.8  # m, of a source from the middle
 
 
@@ -20,6 +21,8 @@ def plume(seed: int) -> SmokeScene:
     """The scene of a number; the same for ever."""
     draw = np.random.default_rng([seed, 7])
     wind_speed, wind_angle = 1.2 * draw.random() ** 1.5, draw.uniform(0, 2 * math.pi)
+    if seed >= _WINDIER:
+        wind_speed *= 1.5 / max(wind_speed, 1e-3) ** (1 / 3)  # as often strong as weak
     wind = wind_speed * math.cos(wind_angle), wind_speed * math.sin(wind_angle)
     sources = tuple(_source(draw, wind) for _ in range(draw.choice([1, 2, 3], p=[0.65, 0.25, 0.1])))
     return SmokeScene(

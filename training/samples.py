@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -18,15 +18,19 @@ from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 
 _CELLS = (0.32, 0.56)  # m, the least and the largest voxel
-_PIXELS = (56, 96)  # width, height
+_LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lesson:
-    """density [X, Y, Z] in scale/voxel, velocity [X, Y, Z, 3] in voxels a stride, along the grid's own axes."""
+    """density [X, Y, Z] in scale/voxel, velocity [X, Y, Z, 3] in voxels a stride, along the grid's own axes.
+
+    size [2]: width and height of the window's images, px, before zeros made all lessons' equally large.
+    """
 
     window: Window
+    size: np.ndarray
     density: np.ndarray
     velocity: np.ndarray
 
@@ -42,7 +46,8 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     cell = draw.uniform(*_CELLS)
     reach = 0.5 * SHAPE[2] * cell
     centre = np.array([*draw.normal(0.0, 0.9, 2), reach + draw.uniform(-0.1, 0.25) * (20.0 - 2 * reach) + draw.normal(0.0, 0.5)])
-    views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL)
+    size = draw.integers(_LEAST, _MOST, endpoint=True)
+    views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = Lattice(origin=plume.origin, voxel_size=VOXEL_SIZE, shape=plume.density.shape[1:])  # type: ignore[arg-type]
     source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
@@ -58,7 +63,8 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     window = look(depth_at, lambda index: views[index], stand, source, moment - first, stride=stride, num_frames=num_frames)
     density, velocity = truth(plume, moment, stand)
     return Lesson(
-        window=window,
+        window=replace(window, images=np.pad(window.images, ((0, 0), (0, _MOST[1] - size[1]), (0, _MOST[0] - size[0])))),
+        size=size,
         density=density * (cell / window.scale),
         velocity=velocity * (stride / FPS / cell),
     )
@@ -75,20 +81,20 @@ def truth(plume: Plume, moment: int, stand: Stand) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def _views(draw: np.random.Generator, kind: str, num_frames: int, *, height: float, pixel: float) -> list[View]:
-    """A camera on a tripod, on an orbit or walking by, that looks at `height` m with pixels of `pixel` m."""
+def _views(draw: np.random.Generator, kind: str, num_frames: int, *, height: float, pixel: float, size: np.ndarray) -> list[View]:
+    """A camera on a tripod, on an orbit or walking by, that looks at `height` m with `size` pixels of `pixel` m."""
     rate = 0.0 if kind == "still" else draw.choice([-1, 1]) * draw.uniform(0.15, 0.7)  # degrees a frame
     start, elevation = draw.uniform(-180, 180), draw.uniform(2, 20)
     distance = draw.uniform(22, 45)
     orbit = Orbit(
         target=(*draw.normal(0.0, 0.4, 2), height + draw.normal(0.0, 0.4)),
         distance=distance,
-        half_height=0.5 * _PIXELS[1] * pixel,
+        half_height=0.5 * size[1] * pixel,
         elevation=elevation,
         azimuth_start=start,
         azimuth_stop=start + rate * num_frames,
     )
-    width, height = _PIXELS
+    width, height = int(size[0]), int(size[1])
     cameras = orbit_cameras(orbit, width=width, height=height, fps=FPS, num_frames=num_frames)
     climb = draw.normal(0.0, 4.0) if kind == "wild" else 0.0  # m over the clip
     views = []

@@ -2,12 +2,14 @@
 
     .venv/backend/bin/python -m training.train --lessons DIR --out DIR [--passes 20] [--start OTHER/state.pt]
 
+What is scored and ships is the running mean of the weights: after one pass or another the same scene differs more than it gains.
 OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass; OUT/plumes.npz: the weights as they ship.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import math
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from backend.io.atomic import whole_file
 from backend.prior.network import PlumeNet, Sight
@@ -28,6 +31,7 @@ _HELD_BACK = 10  # every such plume
 _SCORED = 4  # every such lesson of those held back
 _SLOW = 0.2  # voxels a stride: motion that need not be known better than that
 _BATCH = 8
+_FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
 
 class Lessons:
@@ -76,6 +80,15 @@ def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor,
     return total, parts
 
 
+def take_over(net: PlumeNet, state: dict[str, Tensor]) -> None:
+    """The weights of an earlier net, perhaps of one with fewer inputs: those it did not have have no say at first."""
+    for name, weight in net.state_dict().items():
+        if name.endswith("entry.weight"):
+            missing = weight.shape[1] - state[name].shape[1]
+            state[name] = functional.pad(state[name], (0, 0, 0, 0, 0, 0, 0, missing))
+    net.load_state_dict(state)
+
+
 def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
     """Means over lessons held back: correlation of density, and of velocity inside smoke along the grid's axes."""
     net.eval()
@@ -112,13 +125,16 @@ def main(arguments: list[str]) -> int:
     lessons, unseen = Lessons([path for path in paths if path not in held]), Lessons(held)
     torch.manual_seed(0)
     net = PlumeNet().to(memory_format=torch.channels_last_3d)
+    if given.start:
+        state = torch.load(given.start, weights_only=True)
+        take_over(net, state.get("mean", state["net"]))
+    mean = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-4)
     first = 0
-    if given.start:
-        net.load_state_dict(torch.load(given.start, weights_only=True)["net"])
     if (given.out / "state.pt").exists():
         state = torch.load(given.out / "state.pt", weights_only=True)
         net.load_state_dict(state["net"])
+        mean.load_state_dict(state["mean"])
         optimiser.load_state_dict(state["optimiser"])
         first = state["passes"]
     num_steps = len(lessons) // _BATCH
@@ -135,16 +151,21 @@ def main(arguments: list[str]) -> int:
             total.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimiser.step()
+            share = max(_FORGOTTEN, 1 / (number * num_steps + step + 1))
+            with torch.no_grad():
+                for kept, now in zip(mean.parameters(), net.parameters(), strict=True):
+                    kept.lerp_(now, share)
             sums += parts
         line: dict[str, object] = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
-        line |= {"seconds": round(time.monotonic() - begin, 1), **score(net, unseen)}
+        line |= {"seconds": round(time.monotonic() - begin, 1), **score(mean, unseen)}
         print(json.dumps(line), flush=True)
         with open(given.out / "log.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         with whole_file(given.out / "state.pt") as part:
-            torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "passes": number + 1}, part)
+            kept = {"net": net.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
+            torch.save({**kept, "passes": number + 1}, part)
         with whole_file(given.out / "plumes.npz") as part, open(part, "wb") as file:
-            save_weights(net, file)
+            save_weights(mean, file)
     return 0
 
 

@@ -44,7 +44,7 @@ class FramesConfig:
     frame_rate: frames per second; 0 takes it from the file (image sequences: 24).
     """
 
-    working_size: int = 256
+    working_size: int = 192
     frame_rate: float = 0.0
 
     def __post_init__(self) -> None:
@@ -154,7 +154,7 @@ class VisualConfig:
 
     num_particles: int = 6000
     iterations: int = 6
-    mass_iterations: int = 2
+    mass_iterations: int = 1
     consistency: float = 0.1
     color: str = "auto"
 
@@ -257,11 +257,11 @@ class Config:
 def draft() -> Config:
     """A first look."""
     return Config(
-        frames=FramesConfig(working_size=192),
+        frames=FramesConfig(working_size=128),
         physical=PhysicalConfig(num_particles=1000, solver_iterations=2, correction_iterations=2),
-        visual=VisualConfig(num_particles=4000, iterations=3),
+        visual=VisualConfig(num_particles=3000, iterations=3),
         published=PublishedConfig(num_physical=1000, num_particles=4000, physical_iterations=6, visual_iterations=6),
-        export=ExportConfig(max_voxels=128),
+        export=ExportConfig(max_voxels=96),
     )
 
 
@@ -274,6 +274,7 @@ def final() -> Config:
     """As good as it gets."""
     return Config(
         frames=FramesConfig(working_size=480),
+        volume=VolumeConfig(every=1),
         physical=PhysicalConfig(num_particles=4000, solver_iterations=4, correction_iterations=8),
         visual=VisualConfig(num_particles=24000, iterations=16),
         published=PublishedConfig(num_physical=4000, num_particles=24000, physical_iterations=30, visual_iterations=30),

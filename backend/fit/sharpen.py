@@ -8,21 +8,25 @@ from backend.field.rays import at_voxels, optical_depth
 from backend.geometry.camera import View
 from backend.prior.window import Stand
 
-SHARPNESS = 1.5  # tuned on puff_front, merging_sources and steady_plume
+SHARPNESS = 0.75  # tuned on puff_front, merging_sources and steady_plume, both
+LASTING = 1.0
 _UPDATES = 4  # towards the frame's own optical depth
 _FLOOR = 0.01  # optical depth added to both sides of a ratio
+_THIN = 1e-3  # of the largest lasting density, added everywhere
 _MOST_RATIO = 4.0
 
 
-def sharpened(density: np.ndarray) -> np.ndarray:
-    """Density [X, Y, Z] 1/m to a power, with the largest as it was.
+def sharpened(density: np.ndarray, lasting: np.ndarray) -> np.ndarray:
+    """Density [X, Y, Z] 1/m to a power, with the largest as it was, times a power of the lasting density's share of its largest.
 
     A network that was taught by squared errors answers with a mean over all that could be: a thin haze lies wherever smoke
     might have been, and from aside a picture shows all of it. Once the rays have their sums back, the haze has gone to
-    where most smoke is; there may be several such places on a ray.
+    where most smoke is, in this frame and in those around it; there may be several such places on a ray.
     """
-    largest = float(density.max(initial=0.0))
-    return density if largest <= 0.0 else largest * (density / largest) ** SHARPNESS
+    largest, most = float(density.max(initial=0.0)), float(lasting.max(initial=0.0))
+    if largest <= 0.0 or most <= 0.0:
+        return density
+    return largest * (density / largest) ** SHARPNESS * (lasting / most + _THIN) ** LASTING
 
 
 def agreed(density: np.ndarray, stand: Stand, depth: np.ndarray, view: View) -> np.ndarray:

@@ -31,9 +31,13 @@ _LARGEST_STEP = 6.0  # voxels a stride that a path may take
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sight:
-    """A batch of windows. images [B, O, h, w], matrices [B, O, 3, 4], strides [B, O], conditions [B, N], source [B, 3]."""
+    """A batch of windows. images [B, O, h, w], matrices [B, O, 3, 4], strides [B, O], conditions [B, N], source [B, 3].
+
+    sizes [B, 2]: width and height of the part of the images that was taken, from the first column and row on.
+    """
 
     images: Tensor
+    sizes: Tensor
     matrices: Tensor
     strides: Tensor
     conditions: Tensor
@@ -88,38 +92,43 @@ class PlumeNet(nn.Module):
     def __init__(self, widths: tuple[int, ...] = (64, 96, 96)) -> None:
         super().__init__()
         self.widths = widths
-        self.first = UNet(len(OFFSETS) + 3, widths)
-        self.second = UNet(len(OFFSETS) + len(_BESIDE) + 4 + 3, widths)
+        self.first = UNet(len(OFFSETS) + 4, widths)
+        self.second = UNet(len(OFFSETS) + len(_BESIDE) + 4 + 4, widths)
 
     def forward(self, sight: Sight, shape: tuple[int, int, int]) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         axes = [torch.arange(size, dtype=torch.float32, device=sight.images.device) for size in shape]
         voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)  # [X, Y, Z, 3]
         batch = len(sight.images)
         here = voxels.expand(batch, len(OFFSETS), *voxels.shape)
-        standing = seen_at(sight.images, sight.matrices, here)
+        standing, is_inside = seen_at(sight, here)
         now = standing[:, _NOW]
         places = ((voxels - sight.source[:, None, None, None]) / 10).permute(0, 4, 1, 2, 3)
+        places = torch.cat([places, is_inside[:, _NOW, None]], dim=1)
         guess = _density_and_velocity(self.first(torch.cat([standing, places], dim=1), sight.conditions), now)
         with torch.no_grad():
-            followed = seen_at(sight.images, sight.matrices, follow(guess[1], voxels, sight.strides))
+            followed, _ = seen_at(sight, follow(guess[1], voxels, sight.strides))
         beside = [followed, standing[:, _BESIDE], guess[0][:, None], guess[1], places]
         found = self.second(torch.cat(beside, dim=1), sight.conditions)
         density, change = _density_and_velocity(found, now)
         return guess, (density, guess[1] + change)
 
 
-def seen_at(images: Tensor, matrices: Tensor, voxels: Tensor) -> Tensor:
-    """Images [B, O, h, w] looked up where voxel places [B, O, X, Y, Z, 3] are seen, bilinearly, 0 outside -> [B, O, X, Y, Z]."""
-    batch, count, height, width = images.shape
+def seen_at(sight: Sight, voxels: Tensor) -> tuple[Tensor, Tensor]:
+    """What the images show where voxel places [B, O, X, Y, Z, 3] are, bilinearly, and 1 where that is inside of them, both
+    [B, O, X, Y, Z]. Outside of an image counts what is at its border: smoke that leaves it goes on."""
+    batch, count, height, width = sight.images.shape
     shape = voxels.shape[2:5]
     flat = voxels.reshape(batch * count, -1, 3)
-    seen = flat @ matrices[..., :3].reshape(-1, 3, 3).transpose(1, 2) + matrices[..., 3].reshape(-1, 1, 3)
-    size = torch.tensor([width, height], dtype=torch.float32, device=images.device)
+    seen = flat @ sight.matrices[..., :3].reshape(-1, 3, 3).transpose(1, 2) + sight.matrices[..., 3].reshape(-1, 1, 3)
     # Depth is in the scene's metres, whatever they are: nearer than a thousandth of a voxel counts as that.
-    least = 1e-3 * matrices[..., 2, :3].norm(dim=-1).reshape(-1, 1, 1)
-    grid = seen[..., :2] * (2 / size) * torch.maximum(seen[..., 2:], least).reciprocal() + (1 / size - 1)
-    found = functional.grid_sample(images.reshape(-1, 1, height, width), grid[:, None], align_corners=False)
-    return found.reshape(batch, count, *shape)
+    least = 1e-3 * sight.matrices[..., 2, :3].norm(dim=-1).reshape(-1, 1, 1)
+    pixels = seen[..., :2] * torch.maximum(seen[..., 2:], least).reciprocal()
+    last = (sight.sizes - 1).repeat_interleave(count, dim=0)[:, None]
+    nearest = torch.minimum(pixels.clamp_min(0.0), last)
+    is_inside = ((nearest - pixels).abs().amax(-1) < 0.5).float()
+    grid = (2 * nearest + 1) / torch.tensor([width, height], dtype=torch.float32, device=nearest.device) - 1
+    found = functional.grid_sample(sight.images.reshape(-1, 1, height, width), grid[:, None], align_corners=False)
+    return found.reshape(batch, count, *shape), is_inside.reshape(batch, count, *shape)
 
 
 def follow(velocity: Tensor, voxels: Tensor, strides: Tensor) -> Tensor:

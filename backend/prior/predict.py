@@ -61,7 +61,8 @@ class Prior:
         window = look(depth_at, view_at, stand, source, frame, stride=stride, num_frames=num_frames)
         with torch.no_grad(), one_thread():
             names = ("images", "matrices", "strides", "conditions", "source")
-            sight = Sight(**{name: torch.from_numpy(getattr(window, name))[None] for name in names})
+            sizes = torch.tensor([window.images.shape[:0:-1]], dtype=torch.float32)
+            sight = Sight(sizes=sizes, **{name: torch.from_numpy(getattr(window, name))[None] for name in names})
             density, velocity = self.net(sight, SHAPE)[1]
         to_world = stand.from_world[:3, :3]
         speed = voxel_size / (stride * seconds_per_frame)

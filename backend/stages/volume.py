@@ -1,4 +1,8 @@
-"""Where in depth the smoke is and how it moves: for each frame what the prior proposes, on a grid before its camera."""
+"""Where in depth the smoke is and how it moves: for each frame what the prior proposes, on a grid before its camera.
+
+First the prior is asked about some frames (`propose`), which takes most of the time; then what it said is carried to those
+between, and brought to agree with what lasts around a frame and with what the frame shows (`run`).
+"""
 
 from __future__ import annotations
 
@@ -11,76 +15,47 @@ import torch
 
 from backend.contract.cameras import Cameras
 from backend.fit.between import between
+from backend.fit.guide import Guide
+from backend.fit.lasting import Sighting, lasting
 from backend.fit.pace import stride_of
 from backend.fit.region import Region, find_region
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
+from backend.geometry.lattice import Lattice
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
-from backend.prior.window import stand_before
+from backend.prior.window import Stand, stand_before
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
-
-
-def run(
-    layers: Series[np.ndarray],  # [H, W, 4] float32 premultiplied linear RGB and opacity
-    cameras: Cameras,
-    report: Report,
-    *,
-    prior: Prior,
-    done: Series[VolumeRecord],
-    stride: int = 0,  # frames between the images that are compared; 0: found from the motion
-    every: int = 1,  # frames, at most a stride: the prior is asked so often; what lies between comes from both sides
-    num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
-) -> Iterator[VolumeRecord]:
-    """Yields the records of the frames behind those that are `done`; none of a clip without smoke.
-
-    The prior knows upright worlds only: the scene is turned upright before it is asked, and its answer back.
-    """
-    scene = make_scene(layers, cameras)
-    straight = upright(up_of(scene.views))
-    anchor = straight[:3, :3] @ scene.anchor
-    scene = replace(scene, views=tuple(turned(view, straight) for view in scene.views), anchor=anchor)
-    region = find_region(layers, scene)
-    last = len(layers) - 1
-    if region is None or len(done) > last:
-        return
-    stride = stride or stride_of(region)
-    every = min(every, stride)
-    asking = _Asking(prior=prior, region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame)
-    asked = [*range(len(done) // every * every, last, every), last]
-    at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
-    frame, before = len(done), None
-    with ThreadPoolExecutor(at_once) as pool:
-        for first in range(0, len(asked), at_once):
-            report.progress(frame, len(layers))
-            part = asked[first : first + at_once]
-            with one_thread():
-                answers = list(pool.map(asking.proposed, part))
-            for after in zip(part, answers, strict=True):
-                while frame <= after[0]:
-                    yield asking.recorded(asking.amid(before or after, after, frame), frame)
-                    frame += 1
-                before = after
-    report.progress(len(layers), len(layers))
+_REACH = 15  # strides to either side that count for what lasts
+_APART = 5  # strides between the moments at which it is found
+_LONGER = 8  # a proposal takes as long as so many records
+_WIDE = 28  # voxels of its grid to either side, which has to hold those of all cameras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Asking:
-    """A clip in its upright world. straight [4, 4]: the clip's own to that; stride: frames; seconds: of a frame."""
+class Plan:
+    """A clip in its upright world. straight [4, 4]: the clip's own to that; stride: frames; seconds: of a frame; asked: the
+    frames that the prior is asked about, the first and the last among them."""
 
-    prior: Prior
     region: Region
     straight: np.ndarray
     stride: int
     seconds: float
+    asked: tuple[int, ...]
 
-    def proposed(self, frame: int) -> Proposal:
+    @property
+    def work(self) -> int:
+        """Steps of its progress."""
+        return _LONGER * len(self.asked) + len(self.region.depths)
+
+    def proposed(self, prior: Prior, frame: int) -> Proposal:
+        """The prior's own word on a frame."""
         region = self.region
-        return self.prior.propose(
+        return prior.propose(
             lambda number: region.depths[number],
             lambda number: region.views[number],
             region.centre,
@@ -92,29 +67,133 @@ class _Asking:
             seconds_per_frame=self.seconds,
         )
 
-    def amid(self, before: tuple[int, Proposal], after: tuple[int, Proposal], frame: int) -> Proposal:
-        """Of a frame behind the one and not behind the other."""
-        if frame == after[0]:
-            return after[1]
-        region, count = self.region, after[0] - before[0]
-        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size, shape=SHAPE)
-        share = (frame - before[0]) / count
-        return between(before[1], after[1], stand, share=share, seconds=count * self.seconds)
-
-    def recorded(self, proposal: Proposal, frame: int) -> VolumeRecord:
-        """In the clip's own world, as the frame shows it."""
+    def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
+        """Of a frame behind that of `index` among those asked and not behind the next."""
+        first, last = self.asked[index : index + 2]
+        if frame == last:
+            return after
         region = self.region
-        density = agreed(sharpened(proposal.density), proposal.stand, region.depths[frame], region.views[frame])
-        density, density_unit = _halved(density)
-        velocity, velocity_unit = _halved(proposal.velocity @ self.straight[:3, :3].astype(np.float32))
-        return VolumeRecord(
-            density=density,
-            velocity=velocity,
-            from_world=proposal.stand.from_world @ self.straight,
-            voxel_size=np.asarray(region.voxel_size),
-            density_unit=density_unit,
-            velocity_unit=velocity_unit,
+        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size, shape=SHAPE)
+        return between(before, after, stand, share=(frame - first) / (last - first), seconds=(last - first) * self.seconds)
+
+    def record(self, proposal: Proposal, lasts: np.ndarray, frame: int) -> VolumeRecord:
+        """In the clip's own world, as the frame shows it. lasts [X, Y, Z]: on the proposal's voxels."""
+        region = self.region
+        density = sharpened(proposal.density, lasts)
+        density = agreed(density, proposal.stand, region.depths[frame], region.views[frame])
+        return _packed(
+            replace(proposal, density=density, velocity=proposal.velocity @ self.straight[:3, :3].astype(np.float32)),
+            proposal.stand.from_world @ self.straight,
         )
+
+
+def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, every: int = 1) -> Plan | None:
+    """None of a clip without smoke. layers: [H, W, 4] float32 premultiplied linear RGB and opacity.
+
+    stride: frames between the images that are compared; 0: found from the motion. every: frames, at most a stride: the prior
+    is asked so often. The prior knows upright worlds only: the scene is turned upright before it is asked, its answer back.
+    """
+    scene = make_scene(layers, cameras)
+    straight = upright(up_of(scene.views))
+    anchor = straight[:3, :3] @ scene.anchor
+    scene = replace(scene, views=tuple(turned(view, straight) for view in scene.views), anchor=anchor)
+    region = find_region(layers, scene)
+    if region is None:
+        return None
+    stride, last = stride or stride_of(region), len(layers) - 1
+    asked = (*range(0, last, min(every, stride)), last)
+    return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked)
+
+
+def propose(
+    plan: Plan,
+    report: Report,
+    *,
+    prior: Prior,
+    done: Series[VolumeRecord],
+    num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
+) -> Iterator[VolumeRecord]:
+    """Yields what the prior says of the asked frames behind those that are `done`, in the upright world."""
+    at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
+    num_done = len(done)
+    left = plan.asked[num_done:]
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(left), at_once):
+            report.progress(_LONGER * (num_done + first), plan.work)
+            with one_thread():
+                answers = list(pool.map(lambda frame: plan.proposed(prior, frame), left[first : first + at_once]))
+            yield from (_packed(answer, answer.stand.from_world) for answer in answers)
+
+
+def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator[VolumeRecord]:
+    """Yields the records of all frames. proposals: what `propose` made of all asked frames."""
+    lasts = _Lasting(plan, proposals)
+    before = after = _unpacked(proposals[0])
+    yield plan.record(before, lasts.at(before.stand, 0), 0)
+    for index, last in enumerate(plan.asked[1:]):
+        before, after = after, _unpacked(proposals[index + 1])
+        for frame in range(plan.asked[index] + 1, last + 1):
+            report.progress(_LONGER * len(plan.asked) + frame, plan.work)
+            proposal = plan.amid(before, after, index, frame)
+            yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
+    report.progress(plan.work, plan.work)
+
+
+class _Lasting:
+    """What lasts around each frame: found at some moments, linear between."""
+
+    def __init__(self, plan: Plan, proposals: Series[VolumeRecord]) -> None:
+        self.plan, self.proposals = plan, proposals
+        apart = max(1, round(plan.stride * len(plan.asked) / len(plan.region.depths)))
+        self.looked = range(0, len(plan.asked), apart)  # which of those asked
+        self.moments = sorted({*(plan.asked[index] for index in self.looked[::_APART]), plan.asked[-1]})
+        size, shape = plan.region.voxel_size, (_WIDE, _WIDE, SHAPE[2])
+        origin = plan.region.centre - 0.5 * size * (np.array(shape) - 1)
+        self.lattice = Lattice(origin=tuple(origin), voxel_size=size, shape=shape)
+        self.stand = Stand(lattice=self.lattice, from_world=np.eye(4))
+        self.found: dict[int, np.ndarray] = {}
+
+    def at(self, stand: Stand, frame: int) -> np.ndarray:
+        """[X, Y, Z] on the voxels of a stand."""
+        later = next(moment for moment in self.moments if moment >= frame)
+        earlier = max((moment for moment in self.moments if moment <= frame), default=later)
+        share = (frame - earlier) / max(later - earlier, 1)
+        self.found = {moment: self.found[moment] if moment in self.found else self._around(moment) for moment in {earlier, later}}
+        values = (1.0 - share) * self.found[earlier] + share * self.found[later]
+        return self.stand.at(values, stand.centres().reshape(-1, 3), outside="nearest").reshape(stand.lattice.shape)
+
+    def _around(self, moment: int) -> np.ndarray:
+        plan, points = self.plan, self.stand.centres().reshape(-1, 3)
+        guess, sightings, reach = np.zeros(len(points), np.float32), [], _REACH * plan.stride
+        for index in self.looked:
+            frame = plan.asked[index]
+            weight = 1.0 - abs(frame - moment) / reach
+            if weight <= 0.0:
+                continue
+            proposal = _unpacked(self.proposals[index])
+            guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="constant")
+            sightings.append(Sighting(depth=plan.region.depths[frame], view=plan.region.views[frame], weight=weight))
+        total = sum(sighting.weight for sighting in sightings)
+        floor = 1e-6 * float(guess.max(initial=0.0))
+        return lasting((guess / np.float32(total) + np.float32(floor)).reshape(self.lattice.shape), self.lattice, sightings)
+
+
+def _packed(proposal: Proposal, from_world: np.ndarray) -> VolumeRecord:
+    density, density_unit = _halved(proposal.density)
+    velocity, velocity_unit = _halved(proposal.velocity)
+    return VolumeRecord(
+        density=density,
+        velocity=velocity,
+        from_world=from_world,
+        voxel_size=np.asarray(proposal.stand.lattice.voxel_size),
+        density_unit=density_unit,
+        velocity_unit=velocity_unit,
+    )
+
+
+def _unpacked(record: VolumeRecord) -> Proposal:
+    guide = Guide(record)
+    return Proposal(stand=guide.stand, density=guide.density, velocity=guide.velocity)
 
 
 def _halved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,8 @@ def view(frame: int) -> View:
 
 def sight(window: Window) -> Sight:
     names = ("images", "matrices", "strides", "conditions", "source")
-    return Sight(**{name: torch.from_numpy(getattr(window, name))[None] for name in names})
+    sizes = torch.tensor([[30.0, 50.0]])
+    return Sight(sizes=sizes, **{name: torch.from_numpy(getattr(window, name))[None] for name in names})
 
 
 def window_at(frame: int, *, shape: tuple[int, int, int] = SMALL, stride: int = 1) -> Window:
@@ -58,14 +60,31 @@ def test_lookups_agree_with_the_projection_of_views() -> None:
     stand = stand_before(view(20), np.array([0.3, -0.2, 8.0]), voxel_size=0.8, shape=SMALL)
     axes = [torch.arange(size, dtype=torch.float32) for size in SMALL]
     voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    found = seen_at(*(part for part in (sight(window).images, sight(window).matrices)), voxels.expand(1, len(OFFSETS), *SMALL, 3))
+    found, inside = seen_at(sight(window), voxels.expand(1, len(OFFSETS), *SMALL, 3))
     for index, offset in enumerate(OFFSETS):
         frame = 20 + offset
         pixels, _ = stand.seen(view(frame)).project(stand.lattice.centres().reshape(-1, 3))
         is_inside = ((pixels > 0.6) & (pixels < (29.4, 49.4))).all(axis=1).reshape(SMALL)
         wanted = at_voxels(window.images[index], stand.lattice, stand.seen(view(frame)))
         assert is_inside.mean() > 0.5
+        assert inside[0, index].numpy()[is_inside].all()
         np.testing.assert_allclose(found[0, index].numpy()[is_inside], wanted[is_inside], atol=2e-4)
+
+
+def test_beyond_an_image_its_border_goes_on() -> None:
+    window = window_at(20)
+    whole = sight(window)
+    cut = replace(whole, sizes=torch.tensor([[20.0, 50.0]]))  # as if the last ten columns had not been taken
+    axes = [torch.arange(size, dtype=torch.float32) for size in SMALL]
+    voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).expand(1, len(OFFSETS), *SMALL, 3)
+    (found, inside), (of_all, _) = seen_at(cut, voxels), seen_at(whole, voxels)
+    repeated = whole.images.clone()
+    repeated[..., 20:] = repeated[..., 19:20]
+    wanted, _ = seen_at(replace(whole, images=repeated), voxels)
+    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=0)
+    assert 0.2 < inside.mean() < 0.8
+    is_well_inside = inside * (found == of_all) > 0
+    assert is_well_inside.sum() > 0.9 * inside.sum()
 
 
 def test_the_ends_of_a_clip_are_told() -> None:

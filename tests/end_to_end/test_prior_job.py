@@ -103,7 +103,8 @@ def job(clip: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     told = [event for event in heard.events if isinstance(event, events.Stage)]
     assert [(stage.name, stage.index, stage.count) for stage in told] == [(name, n, 9) for n, name in enumerate(STAGES)]
     ends = [event for event in heard.events if isinstance(event, events.Progress) and event.stage == "volume"]
-    assert (ends[-1].step, ends[-1].total) == (NUM_FRAMES, NUM_FRAMES)
+    assert ends[-1].step == ends[-1].total > NUM_FRAMES
+    assert [end.step for end in ends] == sorted(end.step for end in ends)
     return folder
 
 
@@ -155,7 +156,7 @@ def test_an_interrupted_stage_goes_on_and_ends_with_the_same_bytes(job: Path, cl
     heard = run(clip, tmp_path / "job", weights, stop=StopsWhen(look))
     assert watched == kept, "frames that were there are not computed again"
     first = next(event for event in heard.events if isinstance(event, events.Progress) and event.stage == "volume")
-    assert first.step == len(kept)
+    assert 0 < len(kept) < first.step < first.total
     assert digest(tmp_path / "job") == digest(job)
 
 

@@ -1,0 +1,95 @@
+"""Lessons: what is drawn, how it is mirrored, and that a net with more inputs can take over the weights of one with fewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from backend.prior.network import PlumeNet, Sight, seen_at
+from backend.prior.predict import SHAPE
+from backend.prior.window import OFFSETS
+from training.lessons import write_lessons
+from training.library import NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume, read_plume
+from training.plumes import SIZE, plume
+from training.samples import draw_lesson
+from training.train import Lessons, take_over
+
+SHAPE_OF_PLUME = tuple(round(size / VOXEL_SIZE) for size in SIZE)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A column of smoke that leans and rises, as the library keeps plumes."""
+    path = tmp_path_factory.mktemp("plumes") / "0003"
+    path.mkdir()
+    x, y, z = np.meshgrid(*(np.arange(size) for size in SHAPE_OF_PLUME), indexing="ij")
+    column = 120 * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / 12)
+    density = np.stack([column * (z < 15 + 0.3 * frame) for frame in range(NUM_FRAMES)]).astype(np.uint8)
+    shape = (NUM_FRAMES // VELOCITY_EVERY + 1, *(size // 2 for size in SHAPE_OF_PLUME), 3)
+    np.save(path / "density.npy", density)
+    np.save(path / "velocity.npy", np.broadcast_to(np.array([0.2, 0.0, 1.5], np.float16), shape))
+    (path / "plume.json").write_text('{"seed": 3, "origin": [-5.83, -5.83, 0.17]}', encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(folder: Path) -> Plume:
+    return read_plume(folder)
+
+
+def test_pictures_have_many_sizes_and_nothing_beyond_them(recorded: Plume) -> None:
+    sizes = set()
+    for number in range(6):
+        lesson = draw_lesson(recorded, np.random.default_rng(number))
+        width, height = lesson.size
+        sizes.add((int(width), int(height)))
+        images = lesson.window.images
+        assert images.shape == (len(OFFSETS), 96, 56)
+        assert images[:, :height, :width].max() > 0.0
+        assert not images[:, height:].any()
+        assert not images[:, :, width:].any()
+        assert lesson.density.shape == SHAPE
+        assert lesson.density.min() >= 0.0
+    assert len(sizes) > 3
+
+
+def test_the_same_number_draws_the_same_lesson_and_scene(recorded: Plume) -> None:
+    a, b = (draw_lesson(recorded, np.random.default_rng(4)) for _ in range(2))
+    assert a.density.tobytes() == b.density.tobytes()
+    assert plume(230) == plume(230)
+    wind = [np.hypot(*plume(seed).wind[:2]) for seed in range(260)]
+    assert np.mean(wind[200:]) > 1.3 * np.mean(wind[:200])  # the later ones are windier
+
+
+def test_a_mirrored_lesson_is_what_a_mirror_shows(folder: Path, tmp_path: Path) -> None:
+    write_lessons(folder, tmp_path / "0003.npz", seed=3, count=2)
+    lessons = Lessons([tmp_path / "0003.npz"])
+    plain, density, velocity = lessons.batch(torch.tensor([0, 1]), mirrored=False)
+    turned, turned_density, turned_velocity = lessons.batch(torch.tensor([0, 1]), mirrored=True)
+    torch.testing.assert_close(turned_density, density.flip(1))
+    torch.testing.assert_close(turned_velocity[:, 0], -velocity[:, 0].flip(1))
+    torch.testing.assert_close(turned_velocity[:, 2], velocity[:, 2].flip(1))
+    axes = [torch.arange(size, dtype=torch.float32) for size in SHAPE]
+    voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).expand(2, len(OFFSETS), *SHAPE, 3)
+    for ours, theirs in zip(seen_at(turned, voxels), seen_at(plain, voxels), strict=True):
+        assert (ours - theirs.flip(2)).abs().mean() < 1e-3
+    assert isinstance(turned, Sight)
+
+
+def test_inputs_that_a_net_did_not_have_have_no_say_at_first(folder: Path, tmp_path: Path) -> None:
+    write_lessons(folder, tmp_path / "0003.npz", seed=3, count=1)
+    sight, _, _ = Lessons([tmp_path / "0003.npz"]).batch(torch.tensor([0]), mirrored=False)
+    torch.manual_seed(0)
+    old, new = PlumeNet((16, 16, 16)), PlumeNet((16, 16, 16))
+    for part in (old.first, old.second):
+        torch.nn.init.normal_(part.exit.weight)
+        with torch.no_grad():
+            part.entry.weight[:, -8:] = 0.0  # the last input: whether the picture shows a place
+    fewer = {name: weight[:, :-8] if name.endswith("entry.weight") else weight for name, weight in old.state_dict().items()}
+    take_over(new, fewer)
+    with torch.no_grad():
+        for ours, theirs in zip(new(sight, SHAPE)[1], old(sight, SHAPE)[1], strict=True):
+            torch.testing.assert_close(ours, theirs)
