@@ -6,6 +6,7 @@ import numpy as np
 
 from backend.field.rays import at_voxels, optical_depth
 from backend.geometry.camera import View
+from backend.geometry.lattice import Lattice
 from backend.prior.window import Stand
 
 SHARPNESS = 0.75  # tuned on puff_front, merging_sources and steady_plume, both
@@ -34,7 +35,12 @@ def agreed(density: np.ndarray, stand: Stand, depth: np.ndarray, view: View) -> 
     the rays (Gordon 1970)."""
     lattice, own = stand.lattice, stand.seen(view)
     for _ in range(_UPDATES):
-        ratio = (depth + _FLOOR) / (optical_depth(density, lattice, own) + _FLOOR)
+        ratio = ratio_to(depth, density, lattice, own)
         ratio = np.clip(ratio, 1.0 / _MOST_RATIO, _MOST_RATIO).astype(np.float32)
         density = density * at_voxels(ratio, lattice, own, outside=1.0)
     return density
+
+
+def ratio_to(depth: np.ndarray, density: np.ndarray, lattice: Lattice, view: View) -> np.ndarray:
+    """[h, w]: optical depth `depth` over that of a density [X, Y, Z] 1/m; near 1 where both are next to nothing."""
+    return (depth + _FLOOR) / (optical_depth(density, lattice, view) + _FLOOR)

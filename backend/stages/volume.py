@@ -16,24 +16,20 @@ import torch
 from backend.contract.cameras import Cameras
 from backend.fit.between import between
 from backend.fit.guide import Guide
-from backend.fit.lasting import Sighting, lasting
+from backend.fit.lasting import Lasting
 from backend.fit.pace import stride_of
 from backend.fit.region import Region, find_region
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
-from backend.geometry.lattice import Lattice
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
-from backend.prior.window import Stand, stand_before
+from backend.prior.window import stand_before
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
-_REACH = 15  # strides to either side that count for what lasts
-_APART = 5  # strides between the moments at which it is found
 _LONGER = 8  # a proposal takes as long as so many records
-_WIDE = 28  # voxels of its grid to either side, which has to hold those of all cameras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +123,7 @@ def propose(
 
 def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator[VolumeRecord]:
     """Yields the records of all frames. proposals: what `propose` made of all asked frames."""
-    lasts = _Lasting(plan, proposals)
+    lasts = Lasting(plan.region, lambda index: _unpacked(proposals[index]), plan.asked, stride=plan.stride)
     before = after = _unpacked(proposals[0])
     yield plan.record(before, lasts.at(before.stand, 0), 0)
     for index, last in enumerate(plan.asked[1:]):
@@ -137,45 +133,6 @@ def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator
             proposal = plan.amid(before, after, index, frame)
             yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
     report.progress(plan.work, plan.work)
-
-
-class _Lasting:
-    """What lasts around each frame: found at some moments, linear between."""
-
-    def __init__(self, plan: Plan, proposals: Series[VolumeRecord]) -> None:
-        self.plan, self.proposals = plan, proposals
-        apart = max(1, round(plan.stride * len(plan.asked) / len(plan.region.depths)))
-        self.looked = range(0, len(plan.asked), apart)  # which of those asked
-        self.moments = sorted({*(plan.asked[index] for index in self.looked[::_APART]), plan.asked[-1]})
-        size, shape = plan.region.voxel_size, (_WIDE, _WIDE, SHAPE[2])
-        origin = plan.region.centre - 0.5 * size * (np.array(shape) - 1)
-        self.lattice = Lattice(origin=tuple(origin), voxel_size=size, shape=shape)
-        self.stand = Stand(lattice=self.lattice, from_world=np.eye(4))
-        self.found: dict[int, np.ndarray] = {}
-
-    def at(self, stand: Stand, frame: int) -> np.ndarray:
-        """[X, Y, Z] on the voxels of a stand."""
-        later = next(moment for moment in self.moments if moment >= frame)
-        earlier = max((moment for moment in self.moments if moment <= frame), default=later)
-        share = (frame - earlier) / max(later - earlier, 1)
-        self.found = {moment: self.found[moment] if moment in self.found else self._around(moment) for moment in {earlier, later}}
-        values = (1.0 - share) * self.found[earlier] + share * self.found[later]
-        return self.stand.at(values, stand.centres().reshape(-1, 3), outside="nearest").reshape(stand.lattice.shape)
-
-    def _around(self, moment: int) -> np.ndarray:
-        plan, points = self.plan, self.stand.centres().reshape(-1, 3)
-        guess, sightings, reach = np.zeros(len(points), np.float32), [], _REACH * plan.stride
-        for index in self.looked:
-            frame = plan.asked[index]
-            weight = 1.0 - abs(frame - moment) / reach
-            if weight <= 0.0:
-                continue
-            proposal = _unpacked(self.proposals[index])
-            guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="constant")
-            sightings.append(Sighting(depth=plan.region.depths[frame], view=plan.region.views[frame], weight=weight))
-        total = sum(sighting.weight for sighting in sightings)
-        floor = 1e-6 * float(guess.max(initial=0.0))
-        return lasting((guess / np.float32(total) + np.float32(floor)).reshape(self.lattice.shape), self.lattice, sightings)
 
 
 def _packed(proposal: Proposal, from_world: np.ndarray) -> VolumeRecord:
