@@ -15,6 +15,7 @@ from backend.contract.light import Light
 from backend.contract.result import CAMERAS_FILE, PARTICLES_FILE, VDB_FOLDER, Result
 from backend.fit import light
 from backend.fit.lift import buoyancy_of, wind_of
+from backend.fit.lone import drawn_out
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord, particle_frame
 from backend.geometry.camera import view_at
@@ -46,16 +47,17 @@ class Asset:
             RecordFile(self.folder.forecast, VisualRecord) as ahead,
             ParticlesWriter(self.folder.particles) as writer,
         ):
-            for record in seen:
-                writer.append(particle_frame(record))
+            cameras = read_cameras(self.folder.cameras)
+            for number, record in enumerate(seen):
+                writer.append(drawn_out(particle_frame(record), view_at(cameras, number)))
             for record in ahead:
-                writer.append(particle_frame(record), is_forecast=True)
+                writer.append(drawn_out(particle_frame(record), view_at(cameras, len(seen) - 1)), is_forecast=True)
             last = fluid[len(fluid) - 1]
             buoyancy, doubt = buoyancy_of(last)
             with open_stage_file(self.folder.smoke) as file:
                 frame_start = int(file.attrs["frame_start"])  # type: ignore[arg-type]
             info = ParticlesInfo(
-                cameras=read_cameras(self.folder.cameras),
+                cameras=cameras,
                 gravity=(0.0, 0.0, -9.81),
                 frame_start=frame_start,
                 buoyancy=_triple(buoyancy),

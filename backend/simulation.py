@@ -11,7 +11,9 @@ from backend.contract.cameras import read_cameras
 from backend.contract.job import read_job
 from backend.contract.result import PARTICLES_FILE, VDB_FOLDER, read_result
 from backend.events_out import EventSink, StageReport, StopRequest
+from backend.fit.lone import drawn_out
 from backend.fit.state import PhysicalRecord, VisualRecord, particle_frame
+from backend.geometry.camera import view_at
 from backend.io.job_folder import JobFolder
 from backend.io.particles import ParticlesWriter, read_particles
 from backend.io.records import RecordFile
@@ -38,8 +40,9 @@ def simulate_job(job: Path, rollout: simulate.Rollout, colliders: Sequence[str],
         ParticlesWriter(target / PARTICLES_FILE) as writer,
     ):
         report = StageReport("simulate", sink, stop)
+        last = view_at(cameras, fitted.num_frames - 1)
         for record in simulate.run(fluid, seen, config.physical, rollout, report, seconds=1.0 / cameras.fps):
-            writer.append(particle_frame(record))
+            writer.append(drawn_out(particle_frame(record), last))
         provenance = {
             **fitted.info.provenance,
             "simulation": {"wind": rollout.wind, "buoyancy": rollout.buoyancy, "colliders": len(colliders)},

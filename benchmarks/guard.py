@@ -49,6 +49,7 @@ LARGEST_FALL = {  # of a score; others are kept for looking at
     "future_input_db": 0.3,
     "density_correlation": 0.01,
     "vdb_correlation": 0.01,
+    "vdb_opacity_db": 0.3,
 }
 LARGEST_RISE = 0.15  # of any kind of work, relative
 

@@ -16,6 +16,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -162,13 +163,15 @@ def is_made(cell: Cell) -> bool:
 
 def warm_up(cells: Sequence[Cell]) -> None:
     """Machine code of the kernels is made and kept before anything is measured: a few frames, with and without the prior."""
-    trial = cells[0].trial
+    trial, root = cells[0].trial, cells[0].root
+    root.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="warm_up_", dir=root))  # others may be at work on other scenes
     for changes in ((), (("volume.use_prior", "false"),)):
         stop = min(trial.frames[0] + 4, trial.frames[1])
         short = Trial(preset=PRESETS[0], changes=changes, frames=(trial.frames[0], stop), scored_from=trial.frames[0])
-        with_folder = Cell(root=cells[0].root / "warm_up", scene=cells[0].scene, trial=short)
+        with_folder = Cell(root=folder, scene=cells[0].scene, trial=short)
         run(with_folder, with_folder.record)
-    shutil.rmtree(cells[0].root / "warm_up")
+    shutil.rmtree(folder)
 
 
 def make(cell: Cell) -> None:

@@ -28,9 +28,15 @@ FRONT, SWEEPS = "trade_front.png", "trade_sweeps.png"
 TITLES = {
     "unseen_db": "views that were never seen (mean of NVS and side), dB",
     "input_smoke_db": "the clip itself, over the smoke, dB",
+    "vdb_opacity_db": "its opacity through the exported volumes, dB",
     "density_correlation": "correlation with the true density",
 }
-LEAST_SPAN = {"unseen_db": 1.0, "input_smoke_db": 1.0, "density_correlation": 0.05}  # what is nothing should look like nothing
+LEAST_SPAN = {
+    "unseen_db": 1.0,
+    "input_smoke_db": 1.0,
+    "vdb_opacity_db": 1.0,
+    "density_correlation": 0.05,
+}  # what is nothing should look like nothing
 COLORS = {"draft": "tab:green", "preview": "tab:blue", "final": "tab:red"}
 
 
@@ -59,7 +65,7 @@ def comparable(results: Mapping[str, Any]) -> dict[str, Point]:
 def draw_front(results: Mapping[str, Any]) -> Figure:
     """Accuracy over processor seconds, a panel for each measure: every trial, and the front."""
     points = comparable(results)
-    figure, panels = plt.subplots(1, len(MEASURES), figsize=(16, 5.2))
+    figure, panels = plt.subplots(1, len(MEASURES), figsize=(20, 5.2))
     for panel, measure in zip(panels, MEASURES, strict=True):
         for name, point in points.items():
             preset, is_preset = name.split()[0], name in PRESETS

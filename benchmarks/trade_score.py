@@ -13,18 +13,16 @@ import json
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from backend.contract.truth import INPUT_VIEW
 from backend.io.atomic import whole_file, write_text
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
-from backend.io.vdb import read_vdb
 from backend.score import baselines, measures
+from backend.score.exported import Exported, opacity_decibels
 from backend.score.particles import ParticlePrediction
 from backend.score.truth_set import TruthSet, Volume, read_truth_set
 from backend.score.volumes import camera_axes
-from backend.stages.export import vdb_path
 
 VIEWS = (INPUT_VIEW, "nvs", "side")
 INPUT_STEP = 4  # every which frame of the input view is scored; the other views have few
@@ -41,7 +39,9 @@ def score_window(folder: JobFolder, scene: Path, pictures: Path, *, scored: tupl
         for view in VIEWS:
             found |= _view(prediction, truth, view, true_pictures(truth, view, pictures), scored)
         found |= _volumes(prediction, truth, scored)
-        found |= _export(folder, truth, scored, frame_start=particles.info.frame_start)
+        exported = Exported(folder.vdb, frame_start=particles.info.frame_start)
+        found |= _export(exported, truth, true_pictures(truth, INPUT_VIEW, pictures), scored)
+        found["vdb_mib_a_frame"] = _mean([path.stat().st_size / 1024**2 for path in folder.vdb.glob("*.vdb")])
     return {name: round(value, 4) for name, value in found.items() if np.isfinite(value)}
 
 
@@ -122,16 +122,19 @@ def _volumes(prediction: ParticlePrediction, truth: TruthSet, scored: tuple[int,
     return found | {f"velocity_{name}": _mean(velocities.get(f"correlation_{name}", [])) for name in names}
 
 
-def _export(folder: JobFolder, truth: TruthSet, scored: tuple[int, int], *, frame_start: int) -> dict[str, float]:
-    """Of the VDB files: their density at the true voxels, interpolated as Blender does, and how large they are."""
-    values: list[float] = []
-    for frame, real in _moments(truth, scored):
-        grid = read_vdb(vdb_path(folder.vdb, frame - frame_start), "density")
-        places = (real.lattice.centres() - np.array(grid.origin)) / grid.voxel_size
-        ours = map_coordinates(grid.values, np.moveaxis(places, -1, 0), order=1, mode="constant")
-        values.append(measures.correlation(ours, real.density))
-    sizes = [path.stat().st_size for path in folder.vdb.glob("*.vdb")]
-    return {"vdb_correlation": _mean(values), "vdb_mib_a_frame": _mean([size / 1024**2 for size in sizes])}
+def _export(exported: Exported, truth: TruthSet, targets: np.ndarray, scored: tuple[int, int]) -> dict[str, float]:
+    """Of the VDB files: how opaque they are in the input view, and their density at the true voxels."""
+    frames = [frame for frame in frames_of(truth, INPUT_VIEW, scored) if frame < scored[1]]
+    opacities = [
+        opacity_decibels(
+            exported.opacity(truth.view(INPUT_VIEW, frame), frame), np.asarray(targets[truth.frames[INPUT_VIEW].index(frame)])
+        )
+        for frame in frames
+    ]
+    densities = [
+        measures.correlation(exported.density_at(real.lattice, frame), real.density) for frame, real in _moments(truth, scored)
+    ]
+    return {"vdb_opacity_db": _mean(opacities), "vdb_correlation": _mean(densities)}
 
 
 def _moments(truth: TruthSet, scored: tuple[int, int]) -> list[tuple[int, Volume]]:

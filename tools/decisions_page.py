@@ -88,9 +88,10 @@ def _worth(results: dict[str, Any]) -> Iterator[str]:
     yield "## What each decision is worth"
     yield ""
     yield (
-        f"`python -m benchmarks.decisions --out DIR --page`: the benchmark's scenes, frames {first} to {stop - 1}, preset "
-        f"`{results['preset']}`, {threads}; as decided, and with one decision at a time made the other way. Differences to the "
-        "scene as decided: PSNR in dB (positive: the other way is better) and processor time. Nothing was chosen by those with *."
+        f"`python -m benchmarks.decisions --out DIR --page`: the benchmark's scenes, frames {first} to {stop - 1} where a row "
+        f"names no others, preset `{results['preset']}`, {threads}; as decided, and with one decision at a time made the other "
+        "way. Differences to the scene as decided: PSNR in dB (positive: the other way is better) and processor time. Nothing "
+        "was chosen by those with *."
     )
     yield ""
     made = [variant for variant in results["variants"] if variant["is_made"]]

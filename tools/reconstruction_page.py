@@ -73,6 +73,8 @@ VOLUME_COLUMNS: dict[str, tuple[Figure, str]] = {
     "of the prior": (of_volume("correlation", volume="prior_volume"), ".3f"),
     "relative L2": (of_volume("relative_l2"), ".3f"),
     "mass": (of_volume("mass_ratio"), ".3f"),
+    "opacity, dB": (of_volume("particles_opacity_db", volume="exported"), ".2f"),
+    "in the VDB": (of_volume("opacity_db", volume="exported"), ".2f"),
     "sideways": (of_velocity("correlation_sideways"), ".2f"),
     "up": (of_velocity("correlation_up"), ".2f"),
     "depth": (of_velocity("correlation_depth"), ".2f"),

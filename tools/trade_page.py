@@ -21,7 +21,12 @@ FIGURES = DOCS / "results" / "trade.json"
 GUARD = DOCS / "results" / "guard.json"
 PAGE = DOCS / "trade.md"
 
-TITLES = {"unseen_db": "unseen views, dB", "input_smoke_db": "the clip, dB", "density_correlation": "density"}
+TITLES = {
+    "unseen_db": "unseen views, dB",
+    "input_smoke_db": "the clip, dB",
+    "vdb_opacity_db": "the clip's opacity in the VDB, dB",
+    "density_correlation": "density",
+}
 COLUMNS = {  # of the tables of settings: score, form
     "input_smoke_db": ("the clip, smoke", ".2f"),
     "nvs_first_db": ("NVS first third", ".2f"),
@@ -41,9 +46,14 @@ GUARDED = {
     "side_db": "side",
     "future_input_db": "FP (IV)",
     "density_correlation": "density",
+    "vdb_opacity_db": "the clip's opacity in the VDB",
     "vdb_correlation": "density of the VDB",
 }
-EXPORT_COLUMNS = {"vdb_correlation": ("density of the VDB", ".3f"), "vdb_mib_a_frame": ("MiB a frame", ".2f")}
+EXPORT_COLUMNS = {
+    "vdb_opacity_db": ("the clip's opacity in the VDB", ".2f"),
+    "vdb_correlation": ("density of the VDB", ".3f"),
+    "vdb_mib_a_frame": ("MiB a frame", ".2f"),
+}
 
 
 def main() -> int:
@@ -142,8 +152,8 @@ def presets(points: Mapping[str, Point], noise: Mapping[str, float]) -> list[str
     words = (
         "A preset is off the front where something that was measured is nowhere worse and somewhere better, both by more than "
         "noise: in cost, in views that were never seen (the mean of NVS and side), in the clip itself, "
-        "in density. Settings stand as they are here; that a preset lets the clip decide some of them "
-        "(`follow_clip=true`) makes it no other preset.\n"
+        "in its opacity through the exported volumes, in density. Settings stand as they are here; that a preset lets the clip "
+        "decide some of them (`follow_clip=true`) makes it no other preset.\n"
     )
     return [table(head, rows), words]
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from backend.field.rays import optical_depth
+from backend.fit.pace import longest_stride
 from backend.fit.region import PIXELS_A_CELL
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -19,6 +20,7 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 
 _CELLS = (0.32, 0.56)  # m, the least and the largest voxel
 _LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
+_SHORTEST = 15  # frames of a clip
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
 
@@ -37,8 +39,8 @@ class Lesson:
 
 def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     """A random moment, camera and noise."""
-    stride = int(draw.integers(2, 7))
-    num_frames = int(draw.integers(60, NUM_FRAMES + 1))
+    num_frames = int(draw.integers(_SHORTEST, NUM_FRAMES + 1))
+    stride = min(int(draw.integers(2, 7)), longest_stride(num_frames))
     first = int(draw.integers(0, NUM_FRAMES - num_frames + 1))
     candidates = [t for t in range(first, first + num_frames) if t % VELOCITY_EVERY == 0]
     moment = int(draw.choice(candidates))

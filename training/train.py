@@ -1,6 +1,6 @@
 """Train the prior on lessons. Goes on where it was interrupted; every tenth plume is held back and scored.
 
-    .venv/backend/bin/python -m training.train --lessons DIR --out DIR [--passes 20] [--start OTHER/state.pt]
+    .venv/backend/bin/python -m training.train --lessons DIR [DIR ..] --out DIR [--passes 20] [--start OTHER/state.pt]
 
 What is scored and ships is the running mean of the weights: after one pass or another the same scene differs more than it gains.
 OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass; OUT/plumes.npz: the weights as they ship.
@@ -113,16 +113,16 @@ def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lessons", type=Path, required=True)
+    parser.add_argument("--lessons", type=Path, required=True, nargs="+", help="folders with lessons of the same plumes")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--passes", type=int, default=20)
     parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--start", type=Path, help="a state.pt whose net is taught on, perhaps from other lessons")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
-    paths = sorted(given.lessons.glob("*.npz"))
-    held = [path for index, path in enumerate(paths) if index % _HELD_BACK == 5]
-    lessons, unseen = Lessons([path for path in paths if path not in held]), Lessons(held)
+    folders = [sorted(folder.glob("*.npz")) for folder in given.lessons]
+    held = [path for paths in folders for path in paths[5::_HELD_BACK]]
+    lessons, unseen = Lessons([path for paths in folders for path in paths if path not in held]), Lessons(held)
     torch.manual_seed(0)
     net = PlumeNet().to(memory_format=torch.channels_last_3d)
     if given.start:

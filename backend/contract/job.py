@@ -274,7 +274,6 @@ def final() -> Config:
     """As good as it gets."""
     return Config(
         frames=FramesConfig(working_size=480),
-        volume=VolumeConfig(every=1),
         physical=PhysicalConfig(num_particles=4000, solver_iterations=4, correction_iterations=8),
         visual=VisualConfig(num_particles=24000, iterations=16),
         published=PublishedConfig(num_physical=4000, num_particles=24000, physical_iterations=30, visual_iterations=30),

@@ -13,7 +13,7 @@ from scipy import fft, ndimage
 from backend.fit.guide import Guide
 from backend.geometry.camera import View
 
-FOLLOW_PLACES = 0.6  # share of the flow that turns the particles' density into the volume's, a frame
+FOLLOW_PLACES = 0.8  # share of the flow that turns the particles' density into the volume's, a frame
 FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
 _BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio

@@ -13,7 +13,8 @@ from backend.geometry.camera import View, view_at
 
 MAX_OPACITY = 0.99  # an 8-bit frame cannot tell more: beyond it optical depth is a guess
 LEAST_TURN = math.radians(5.0)  # of the camera about the smoke, for anything to be seen of its depth
-MIN_PARALLAX = 0.02  # share of the mean squared sine between rays below which they do not meet anywhere in particular
+MIN_PARALLAX = 0.02  # mean squared sine between rays, below which where they meet is not all that is asked
+CONVENTION = 0.01  # mean squared sine at which the rays say as much of the foot's depth as the world's origin does
 
 FOOT_HEIGHT = 0.05  # of the image
 FOOT_FAINT = 0.02  # of the fullest row: a row with less shows no foot
@@ -66,7 +67,8 @@ def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.nd
     """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to 64 frames.
 
     The foot is what the lowest rows ever show, in the frames in which they show it: a source stands still, while all that
-    has left it drifts, and drift looks like depth to a camera that turns.
+    has left it drifts, and drift looks like depth to a camera that turns. A camera that turns little tells little of depth:
+    then the foot is held to the distance at which smoke stands before a camera that does not move.
     """
     frames = np.unique(np.linspace(0, len(views) - 1, 64).astype(int))
     in_row = np.stack([optical_depth(layers[frame]).sum(axis=1, dtype=np.float64) for frame in frames])  # [F, H]
@@ -87,7 +89,9 @@ def _meeting_point(layers: Series[np.ndarray], views: tuple[View, ...]) -> np.nd
         moment += across @ view.position
         total += 1.0
     if np.linalg.eigvalsh(normal)[0] < MIN_PARALLAX * total:
-        return _standing_point(views[0])
+        forward = views[0].camera_to_world[:3, 2]
+        normal += CONVENTION * total * np.outer(forward, forward)
+        moment += CONVENTION * total * forward * float(forward @ _standing_point(views[0]))
     return np.linalg.solve(normal, moment)
 
 

@@ -60,7 +60,7 @@ def voxelize(frame: ParticleFrame, lattice: Lattice, *, with_color: bool = False
     if with_color:
         grids["color"] = np.zeros((*lattice.shape, 3), np.float32)
     if len(centers) and min(lattice.shape) > 0:
-        _splat(centers, factors, masses / h**3, payload, frame.rotations is not None, grids)
+        _splat(centers, factors, masses / h**3, payload, _are_round(frame), grids)
     return grids
 
 
@@ -71,6 +71,13 @@ def _covariance_factors(frame: ParticleFrame, voxel_size: float) -> np.ndarray: 
         scales = np.repeat(scales[:, None], 3, axis=1)
     axes = np.sqrt(np.maximum(scales * scales - _INTERPOLATION_VARIANCE, MIN_SCALE_VOXELS**2))
     return rotation_matrices(frame.rotations, len(scales)) * axes[:, None, :]
+
+
+def _are_round(frame: ParticleFrame) -> np.ndarray:  # [N] bool
+    if frame.rotations is None:
+        return np.ones(frame.count, bool)
+    scales = np.asarray(frame.scales)
+    return np.ascontiguousarray((scales[:, 0] == scales[:, 1]) & (scales[:, 0] == scales[:, 2]))
 
 
 def rotation_matrices(quaternions: np.ndarray | None, count: int) -> np.ndarray:  # [N, 3, 3]
@@ -112,7 +119,7 @@ def _splat(
     factors: np.ndarray,  # [N, 3, 3] voxels
     weights: np.ndarray,  # [N] m_i / h^3
     payload: np.ndarray,  # [N, 3 or 6] velocity, colour
-    is_anisotropic: bool,
+    is_round: np.ndarray,  # [N]
     grids: dict[str, np.ndarray],
 ) -> None:
     targets = _Targets(grids["density"], grids["velocity"], grids.get("color", np.zeros((0, 0, 0, 3), np.float32)))
@@ -123,14 +130,14 @@ def _splat(
     high = np.clip(np.floor(centers + widths) + 1.0, 0.0, limits).astype(np.int32)
     boxes = _Boxes(low, high, *_members_of_slabs(low, high, targets.density.shape[0]))
     with numba.parallel_chunksize(1):
-        if is_anisotropic:
-            precision = np.linalg.inv(factors @ np.swapaxes(factors, 1, 2))
-            amplitudes = weights / _lattice_sums(centers, widths, precision, np.abs(np.linalg.det(factors)))
-            _fill_anisotropic(centers, precision, amplitudes.astype(np.float32), payload, boxes, targets)
-        else:
-            sigmas = np.ascontiguousarray(factors[:, 0, 0])
-            amplitudes = weights / _axis_sums(centers, sigmas)
-            _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets)
+        others = ~is_round
+        sigmas = np.sqrt(np.sum(factors[:, 0] ** 2, axis=1))  # of round ones along every axis
+        precision = np.linalg.inv(factors @ np.swapaxes(factors, 1, 2))
+        sums = np.empty(len(centers))
+        sums[is_round] = _axis_sums(centers[is_round], sigmas[is_round])
+        volumes = np.abs(np.linalg.det(factors[others]))
+        sums[others] = _lattice_sums(centers[others], widths[others], precision[others], volumes)
+        _fill(centers, sigmas, precision, is_round, weights / sums, payload, boxes, targets)
 
 
 @numba.njit(cache=True)
@@ -173,8 +180,8 @@ def _axis_sums(centers, sigmas):  # -> [N] product over the axes of sum_v exp(-(
 
 
 @numba.njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets):
-    """Separable: three short tables of exponentials, then a product per voxel."""
+def _fill(centers, sigmas, precision, is_round, amplitudes, payload, boxes, targets):
+    """Round ones are separable: three short tables of exponentials, then a product per voxel."""
     num_x, num_y, num_z = targets.density.shape
     for slab in numba.prange(boxes.starts.shape[0] - 1):
         first = slab * _SLAB
@@ -185,9 +192,17 @@ def _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets):
         for member in range(boxes.starts[slab], boxes.starts[slab + 1]):
             p = boxes.members[member]
             cx, cy, cz = centers[p, 0], centers[p, 1], centers[p, 2]
+            z0, z1 = boxes.low[p, 2], boxes.high[p, 2]
+            if not is_round[p]:
+                for i in range(max(boxes.low[p, 0], first), min(boxes.high[p, 0], last)):
+                    for j in range(boxes.low[p, 1], boxes.high[p, 1]):
+                        _gaussian_row(row, precision[p], i - cx, j - cy, z0 - cz, z1 - z0)
+                        for k in range(z1 - z0):
+                            row[k] *= amplitudes[p]
+                        _add_row(row, targets.density[i, j], moments[:, i - first, j], payload[p], z0, z1)
+                continue
             sigma = sigmas[p]
             inverse = -0.5 / (sigma * sigma)
-            z0, z1 = boxes.low[p, 2], boxes.high[p, 2]
             for k in range(z0, z1):
                 table[k - z0] = math.exp(inverse * (k - cz) ** 2)
             for i in range(max(boxes.low[p, 0], first), min(boxes.high[p, 0], last)):
@@ -196,26 +211,6 @@ def _fill_isotropic(centers, sigmas, amplitudes, payload, boxes, targets):
                     along_xy = np.float32(along_x * math.exp(inverse * (j - cy) ** 2))
                     for k in range(z1 - z0):
                         row[k] = along_xy * table[k]
-                    _add_row(row, targets.density[i, j], moments[:, i - first, j], payload[p], z0, z1)
-        _write_means(moments, targets, first)
-
-
-@numba.njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _fill_anisotropic(centers, precision, amplitudes, payload, boxes, targets):
-    num_x, num_y, num_z = targets.density.shape
-    for slab in numba.prange(boxes.starts.shape[0] - 1):
-        first = slab * _SLAB
-        last = min(first + _SLAB, num_x)
-        moments = np.zeros((payload.shape[1], last - first, num_y, num_z), np.float32)
-        row = np.empty(num_z, np.float32)
-        for member in range(boxes.starts[slab], boxes.starts[slab + 1]):
-            p = boxes.members[member]
-            z0, z1 = boxes.low[p, 2], boxes.high[p, 2]
-            for i in range(max(boxes.low[p, 0], first), min(boxes.high[p, 0], last)):
-                for j in range(boxes.low[p, 1], boxes.high[p, 1]):
-                    _gaussian_row(row, precision[p], i - centers[p, 0], j - centers[p, 1], z0 - centers[p, 2], z1 - z0)
-                    for k in range(z1 - z0):
-                        row[k] *= amplitudes[p]
                     _add_row(row, targets.density[i, j], moments[:, i - first, j], payload[p], z0, z1)
         _write_means(moments, targets, first)
 

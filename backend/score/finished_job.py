@@ -23,6 +23,7 @@ from backend.io.particles import Particles, read_particles
 from backend.io.records import RecordFile, open_stage_file
 from backend.reporting import SilentReport
 from backend.score.evaluate import Reports, evaluate
+from backend.score.exported import Exported, exported_scores
 from backend.score.particles import ParticlePrediction, learned_buoyancy, learned_light, mean_divergence
 from backend.score.perceptual import Perceptual
 from backend.score.proposals import Proposals
@@ -93,6 +94,12 @@ def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, 
     scores["buoyancy"] = learned_buoyancy(job.particles)
     scores["light"] = learned_light(job.particles)
     missing = {}
+    frames = [frame for frame in truth.frames[INPUT_VIEW] if frame < truth.num_seen]
+    exported = Exported(job.folder.vdb, frame_start=job.particles.info.frame_start)
+    try:
+        scores["exported"] = exported_scores(exported, job.prediction, truth, frames, report=begin("exported"))
+    except BackendError as error:
+        missing["exported"] = error.message
     if perceptual is None:
         missing["lpips"] = "no weights; --lpips FILE reads them"
     if not scores["volume"]:

@@ -35,7 +35,7 @@ def table(scores: dict[str, Any]) -> str:
     for view, found in scores.get("motion", {}).items():
         if found:
             lines.append(f"{view:<{wide}} tOF {found['tof']} px, of an answer that never moves {found['still']}")
-    for name in ("volume", "prior_volume", "divergence", "buoyancy"):
+    for name in ("volume", "prior_volume", "exported", "divergence", "buoyancy"):
         found = scores.get(name, {})
         figures = {key: value for key, value in found.items() if key != "velocity"} | found.get("velocity", {})
         lines += [f"{name:<{wide}} {key} {value}" for key, value in figures.items()]

@@ -13,7 +13,9 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 COLUMNS = ("density1", "density2", "sideways2", "up2", "depth2")
 
 
-@pytest.mark.parametrize(("name", "passes"), [("prior_training", 8), ("prior_training_on", 4), ("prior_training_wind", 5)])
+@pytest.mark.parametrize(
+    ("name", "passes"), [("prior_training", 8), ("prior_training_on", 4), ("prior_training_wind", 5), ("prior_training_short", 5)]
+)
 def test_the_page_shows_the_log_of_the_training(name: str, passes: int) -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     assert f"docs/results/{name}.jsonl" in page

@@ -179,6 +179,21 @@ def test_rays_through_the_foot_of_the_smoke_meet_at_its_source(goes_out_at: int)
     np.testing.assert_allclose(make_scene(layers[:1], cameras()).anchor, 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("degrees", [0.5, 8.0, 20.0])
+def test_a_camera_that_turns_little_finds_the_source_on_its_ray(degrees: float) -> None:
+    """Not at the height that the camera looks at; as far away as the rays and the world's origin say together."""
+    source = np.array([0.4, -0.3, 0.0])
+    angles = np.radians(np.linspace(-90 - 0.5 * degrees, -90 + 0.5 * degrees, 9))
+    matrices = tuple(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0])) for a in angles)
+    given = cameras(matrices=matrices)
+    feet = [view_at(given, index).project(source[None])[0][0] for index in range(9)]
+    layers = [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
+    scene = make_scene(layers, given)
+    seen = scene.views[4].project(scene.anchor[None])[0][0]
+    assert np.linalg.norm(seen - scene.views[4].project(source[None])[0][0]) < 3.5  # px; the foot is not all in the lowest row
+    assert np.linalg.norm(scene.anchor - source) < 0.5
+
+
 def test_records_take_and_join() -> None:
     layer = layer_of(disc(20.0))
     scene = make_scene([layer], cameras())

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from backend.contract.errors import BackendError
 from backend.contract.light import Light
 from backend.fit.state import VolumeRecord
+from backend.geometry.camera import View
+from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame
+from backend.io.vdb import write_vdb
+from backend.render.picture import picture
+from backend.render.voxelize import voxelize
+from backend.score.exported import Exported, opacity_decibels
 from backend.score.particles import learned_buoyancy, learned_light, mean_divergence
 from backend.score.proposals import Proposals
 from backend.score.truth_set import Volume
+from backend.stages.export import vdb_path
 
 
 def truth_volume() -> Volume:
@@ -54,6 +63,32 @@ def test_proposals_stand_where_their_grids_do() -> None:
     assert not Proposals([record], frame_start=0).volume(far, 0)[0].any()
     with pytest.raises(IndexError):
         Proposals([record], frame_start=0).volume(like, 1)
+
+
+def test_exported_volumes_show_what_particles_show_unless_their_voxels_are_coarse(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    smoke = ParticleFrame(
+        positions=random.normal(0.0, 0.6, (60, 3)).astype(np.float32), velocities=np.zeros((60, 3), np.float32),
+        scales=np.full(60, 0.2, np.float32), optical_masses=np.full(60, 0.1, np.float32),
+        colors=np.full((60, 3), 0.5, np.float32), ids=np.arange(60),
+    )  # fmt: skip
+    camera_to_world = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera_to_world[2, 3] = 9.0
+    view = View(width=64, height=48, fx=90.0, fy=90.0, cx=32.0, cy=24.0, camera_to_world=camera_to_world)
+    seen = picture(smoke, view)
+    found = []
+    for number, voxel_size in enumerate((0.15, 0.6)):
+        count = round(6.0 / voxel_size)
+        lattice = Lattice(origin=(-3.0, -3.0, -3.0), voxel_size=voxel_size, shape=(count, count, count))
+        write_vdb(vdb_path(tmp_path, number), voxelize(smoke, lattice), voxel_size=voxel_size, origin=lattice.origin)
+        opacity = Exported(tmp_path, frame_start=5).opacity(view, 5 + number)
+        found.append(opacity_decibels(opacity, seen))
+    assert found[0] > 38.0 and found[1] < found[0] - 8.0
+    density = Exported(tmp_path, frame_start=0).density_at(lattice, 1)
+    assert np.allclose(density, voxelize(smoke, lattice)["density"], atol=2e-3 * density.max())
+    assert np.isnan(opacity_decibels(np.zeros((48, 64)), np.zeros((48, 64, 4))))
+    with pytest.raises(BackendError, match="smoke_0004"):
+        Exported(tmp_path, frame_start=0).opacity(view, 3)
 
 
 def particles(*frames: ParticleFrame, radius: float = 0.5, buoyancy: tuple[float, ...] = (0.0, 0.0, 0.0)) -> SimpleNamespace:

@@ -111,7 +111,7 @@ def test_the_whole_command(scene: Path, job: Path, perfect: Path, tmp_path: Path
     scores = json.loads(figures.read_text(), parse_constant=pytest.fail)
     table = capsys.readouterr().out
     assert f"{scores['side']['ours']['full_db']:.2f}" in table and "tOF" in table and "lpips: no weights" in table
-    assert set(scores["not_measured"]) == {"lpips"}
+    assert set(scores["not_measured"]) == {"exported", "lpips"}, "the job was made without volumes"
     assert scores["job"] == {"program": "wildsmoke 0", "preset": "draft", "method": "default"}, "no times: equal jobs score equal"
     assert scores["relight"]["ours"]["full_db"] > scores["relight_particles"]["full_db"] + 5.0
     assert scores["relight_by"] == {"program": "Blender 9.9.9", "samples": 16, "width": 48, "height": 64}

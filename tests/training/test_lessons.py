@@ -56,6 +56,13 @@ def test_pictures_have_many_sizes_and_nothing_beyond_them(recorded: Plume) -> No
     assert len(sizes) > 3
 
 
+def test_clips_are_short_and_long(recorded: Plume) -> None:
+    """Of a short clip a window sees less than it could, and compares pictures that are closer in time."""
+    spans = [float(np.ptp(draw_lesson(recorded, np.random.default_rng(number)).window.strides)) for number in range(20)]
+    assert min(spans) < 12.0 and max(spans) > 18.0
+    assert min(spans) >= 7.0, "eight strides at least: what the fit itself sees to"
+
+
 def test_the_same_number_draws_the_same_lesson_and_scene(recorded: Plume) -> None:
     a, b = (draw_lesson(recorded, np.random.default_rng(4)) for _ in range(2))
     assert a.density.tobytes() == b.density.tobytes()

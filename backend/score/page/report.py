@@ -111,7 +111,10 @@ def _motion(scores: Mapping[str, Any]) -> str:
         ["view", "tOF of ours, px", "of what never moves, px"], rows, caption="Error of optical flow inside true smoke"
     )
     found = scores["divergence"]
+    exported = scores.get("exported", {})
     rows = [
+        ["the clip's opacity, dB inside smoke", markup.number(exported.get("particles_opacity_db"))],
+        ["the same through the exported volumes, dB", markup.number(exported.get("opacity_db"))],
         ["mean |div v| as published, 1/s", markup.number(found.get("as_published"), 3)],
         ["the same corrected, 1/s", markup.number(found.get("corrected"), 3)],
         ["particles that the corrected one counts, %", markup.number(100.0 * found.get("coverage", 0.0), 1)],
