@@ -50,8 +50,9 @@ class Asset:
             cameras = read_cameras(self.folder.cameras)
             for number, record in enumerate(seen):
                 writer.append(drawn_out(particle_frame(record), view_at(cameras, number)))
+            view = view_at(cameras, len(seen) - 1)
             for record in ahead:
-                writer.append(drawn_out(particle_frame(record), view_at(cameras, len(seen) - 1)), is_forecast=True)
+                writer.append(drawn_out(particle_frame(record), view), is_forecast=True)
             last = fluid[len(fluid) - 1]
             buoyancy, doubt = buoyancy_of(last)
             with open_stage_file(self.folder.smoke) as file:

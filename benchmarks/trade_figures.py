@@ -31,12 +31,8 @@ TITLES = {
     "vdb_opacity_db": "its opacity through the exported volumes, dB",
     "density_correlation": "correlation with the true density",
 }
-LEAST_SPAN = {
-    "unseen_db": 1.0,
-    "input_smoke_db": 1.0,
-    "vdb_opacity_db": 1.0,
-    "density_correlation": 0.05,
-}  # what is nothing should look like nothing
+# What is nothing should look like nothing.
+LEAST_SPAN = {"unseen_db": 1.0, "input_smoke_db": 1.0, "vdb_opacity_db": 1.0, "density_correlation": 0.05}
 COLORS = {"draft": "tab:green", "preview": "tab:blue", "final": "tab:red"}
 
 

@@ -19,7 +19,7 @@ from backend.io.atomic import whole_file, write_text
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.score import baselines, measures
-from backend.score.exported import Exported, opacity_decibels
+from backend.score.exported import Exported, opacity_in_clip
 from backend.score.particles import ParticlePrediction
 from backend.score.truth_set import TruthSet, Volume, read_truth_set
 from backend.score.volumes import camera_axes
@@ -125,16 +125,11 @@ def _volumes(prediction: ParticlePrediction, truth: TruthSet, scored: tuple[int,
 def _export(exported: Exported, truth: TruthSet, targets: np.ndarray, scored: tuple[int, int]) -> dict[str, float]:
     """Of the VDB files: how opaque they are in the input view, and their density at the true voxels."""
     frames = [frame for frame in frames_of(truth, INPUT_VIEW, scored) if frame < scored[1]]
-    opacities = [
-        opacity_decibels(
-            exported.opacity(truth.view(INPUT_VIEW, frame), frame), np.asarray(targets[truth.frames[INPUT_VIEW].index(frame)])
-        )
-        for frame in frames
-    ]
+    opacity = opacity_in_clip(exported.opacity, truth, targets, frames)
     densities = [
         measures.correlation(exported.density_at(real.lattice, frame), real.density) for frame, real in _moments(truth, scored)
     ]
-    return {"vdb_opacity_db": _mean(opacities), "vdb_correlation": _mean(densities)}
+    return {"vdb_opacity_db": float("nan") if opacity is None else opacity, "vdb_correlation": _mean(densities)}
 
 
 def _moments(truth: TruthSet, scored: tuple[int, int]) -> list[tuple[int, Volume]]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from backend.contract.errors import BackendError
-from backend.contract.result import VDB_NAME
+from backend.contract.result import vdb_path
 from backend.contract.truth import CLIP_VIDEO, INPUT_FOLDER, TRUTH_FILE, TRUTH_FOLDER
 from backend.io.atomic import whole_file
 from synthetic.clip import encode_clip
@@ -86,7 +86,7 @@ def _gather_volumes(folder: Path, preset: Preset) -> list[int]:
         return []
     for frame in frames:
         with whole_file(target / VOLUME_NAME.format(frame)) as part:
-            shutil.copyfile(folder / SMOKE_FOLDER / VDB_NAME.format(frame + 1), part)
+            shutil.copyfile(vdb_path(folder / SMOKE_FOLDER, frame), part)
     return frames
 
 

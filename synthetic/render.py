@@ -24,7 +24,7 @@ if __name__ == "__main__":
 import bpy
 
 from backend.contract.errors import EXIT_DONE, EXIT_USER, BackendError
-from backend.contract.result import CAMERAS_FILE, VDB_NAME
+from backend.contract.result import CAMERAS_FILE, vdb_path
 from backend.contract.truth import view_folder
 from synthetic.claims import claimed
 from synthetic.layers import Layer
@@ -149,7 +149,7 @@ class _SmokeFiles:
     def path(self, frame: int) -> Path:
         if self._files is not None:
             return self._files[frame]
-        path = self._folder / VDB_NAME.format(frame + 1)
+        path = vdb_path(self._folder, frame)
         end = time.monotonic() + self._wait
         while not path.exists():
             if time.monotonic() >= end:

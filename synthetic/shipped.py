@@ -23,7 +23,7 @@ import numpy as np
 from scipy import ndimage
 
 from backend.contract.errors import BackendError
-from backend.contract.result import CAMERAS_FILE, VDB_NAME
+from backend.contract.result import CAMERAS_FILE, vdb_path
 from backend.contract.truth import (
     CLIP_VIDEO,
     FUTURE_VIDEO,
@@ -126,7 +126,7 @@ def pack_volumes(smoke: Path, target: Path, *, num_frames: int) -> dict[str, obj
     volumes.h5: attrs voxel_size m, origin m (centre of the first voxel); density [F, X, Y, Z] 1/m, density_frames [F];
     velocity [G, X, Y, Z, 3] m/s, zero far from smoke, velocity_frames [G]; float16, in steps of 1/128 and 1/32.
     """
-    air = read_vdb(smoke / VDB_NAME.format(1), "velocity")
+    air = read_vdb(vdb_path(smoke, 0), "velocity")
     shape = tuple(size // _COARSER for size in air.values.shape[:3])
     size = air.voxel_size * _COARSER
     origin = tuple(start + 0.5 * (size - air.voxel_size) for start in air.origin)
@@ -135,7 +135,7 @@ def pack_volumes(smoke: Path, target: Path, *, num_frames: int) -> dict[str, obj
     for frame in range(0, num_frames, DENSITY_EVERY):
         for name, every in (("density", DENSITY_EVERY), ("velocity", VELOCITY_EVERY)):
             if frame % every == 0:
-                grid = read_vdb(smoke / VDB_NAME.format(frame + 1), name)
+                grid = read_vdb(vdb_path(smoke, frame), name)
                 stacks[name].append(_coarse(_placed(grid, air), shape))
                 frames[name].append(frame)
         if frame % VELOCITY_EVERY == 0:

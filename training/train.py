@@ -113,7 +113,7 @@ def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lessons", type=Path, required=True, nargs="+", help="folders with lessons of the same plumes")
+    parser.add_argument("--lessons", type=Path, required=True, nargs="+", help="each with lessons of the same plumes")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--passes", type=int, default=20)
     parser.add_argument("--rate", type=float, default=2e-3)

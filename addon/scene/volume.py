@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ...backend.contract.errors import BackendError
-from ...backend.contract.result import VDB_NAME, Result
+from ...backend.contract.result import Result, vdb_path
 from .ownership import mark, owned_name
 
 VOXEL_SIZE_PROPERTY = "wildsmoke_voxel_size"
@@ -64,7 +64,7 @@ def show_sequence(smoke: bpy.types.Object, job: Path, result: Result) -> None:
 
 
 def _first_file(job: Path, result: Result) -> Path:
-    return job / result.vdb_folder / VDB_NAME.format(1)
+    return vdb_path(job / result.vdb_folder, 0)
 
 
 def align(smoke: bpy.types.Object) -> None:

@@ -24,6 +24,11 @@ VDB_NAME = "smoke_{:04d}.vdb"  # numbered from 1, as Blender wants it
 RUNNING_FILE = "running.json"  # {"pid": ..} while a backend works here
 
 
+def vdb_path(folder: Path, frame: int) -> Path:
+    """Where the volume of a frame lies, frames counted from 0."""
+    return folder / VDB_NAME.format(frame + 1)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
     """What a finished job made. Paths are relative to the job folder; frames count from 0.

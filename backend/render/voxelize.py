@@ -132,7 +132,8 @@ def _splat(
     with numba.parallel_chunksize(1):
         others = ~is_round
         sigmas = np.sqrt(np.sum(factors[:, 0] ** 2, axis=1))  # of round ones along every axis
-        precision = np.linalg.inv(factors @ np.swapaxes(factors, 1, 2))
+        precision = np.zeros_like(factors)
+        precision[others] = np.linalg.inv(factors[others] @ np.swapaxes(factors[others], 1, 2))
         sums = np.empty(len(centers))
         sums[is_round] = _axis_sums(centers[is_round], sigmas[is_round])
         volumes = np.abs(np.linalg.det(factors[others]))

@@ -5,12 +5,13 @@ Particles are finer than voxels. What a grid loses of them is seen at once in th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
+from backend.contract.result import vdb_path
 from backend.contract.truth import INPUT_VIEW
 from backend.field.rays import optical_depth
 from backend.geometry.camera import View
@@ -20,8 +21,7 @@ from backend.reporting import Report, SilentReport
 from backend.score import measures
 from backend.score.evaluate import Prediction
 from backend.score.tally import mean
-from backend.score.truth_set import Truth
-from backend.stages.export import vdb_path
+from backend.score.truth_set import Pictures, Truth
 
 _MOST_FRAMES = 12  # that are looked at, spread evenly
 
@@ -55,19 +55,34 @@ def opacity_decibels(opacity: np.ndarray, truth: np.ndarray) -> float:
     return measures.decibels(float(np.square(opacity - truth[..., 3], dtype=np.float64)[mask].mean()) if mask.any() else np.nan)
 
 
+def opacity_in_clip(
+    opacity_at: Callable[[View, int], np.ndarray],  # view, video frame -> [H, W]
+    truth: Truth,
+    pictures: Pictures,  # of the input view
+    frames: Sequence[int],
+    *,
+    report: Report | None = None,
+) -> float | None:
+    """Mean of opacity_decibels over frames of the input view; None where none shows smoke."""
+    report, places, found = report or SilentReport(), truth.frames[INPUT_VIEW], []
+    for step, frame in enumerate(frames):
+        report.progress(step, len(frames))
+        opacity = opacity_at(truth.view(INPUT_VIEW, frame), frame)
+        found.append(opacity_decibels(opacity, np.asarray(pictures[places.index(frame)])))
+    report.progress(len(frames), len(frames))
+    return mean(found)
+
+
 def exported_scores(
-    exported: Exported, prediction: Prediction, truth: Truth, frames: Sequence[int], *, report: Report | None = None
+    exported: Exported, prediction: Prediction, truth: Truth, *, report: Report | None = None
 ) -> dict[str, float | None]:
     """Of some seen frames the clip's opacity through the exported volumes, and as the particles themselves show it."""
-    report = report or SilentReport()
-    pictures, places = truth.pictures(INPUT_VIEW), truth.frames[INPUT_VIEW]
-    looked = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FRAMES))]
-    rows = []
-    for step, frame in enumerate(looked):
-        report.progress(step, len(looked))
-        view, real = truth.view(INPUT_VIEW, frame), np.asarray(pictures[places.index(frame)])
-        shown = exported.opacity(view, frame), prediction.picture(view, frame)[..., 3]
-        rows.append([opacity_decibels(opacity, real) for opacity in shown])
-    report.progress(len(looked), len(looked))
-    columns = zip(*rows, strict=True)
-    return {name: mean(list(values)) for name, values in zip(("opacity_db", "particles_opacity_db"), columns, strict=True)}
+    seen = [frame for frame in truth.frames[INPUT_VIEW] if frame < truth.num_seen]
+    frames = [seen[round(index)] for index in np.linspace(0, len(seen) - 1, min(len(seen), _MOST_FRAMES))]
+    pictures = truth.pictures(INPUT_VIEW)
+    return {
+        "opacity_db": opacity_in_clip(exported.opacity, truth, pictures, frames, report=report),
+        "particles_opacity_db": opacity_in_clip(
+            lambda view, frame: prediction.picture(view, frame)[..., 3], truth, pictures, frames
+        ),
+    }

@@ -94,10 +94,9 @@ def scores_of(job: FinishedJob, truth: Truth, *, perceptual: Perceptual | None, 
     scores["buoyancy"] = learned_buoyancy(job.particles)
     scores["light"] = learned_light(job.particles)
     missing = {}
-    frames = [frame for frame in truth.frames[INPUT_VIEW] if frame < truth.num_seen]
     exported = Exported(job.folder.vdb, frame_start=job.particles.info.frame_start)
     try:
-        scores["exported"] = exported_scores(exported, job.prediction, truth, frames, report=begin("exported"))
+        scores["exported"] = exported_scores(exported, job.prediction, truth, report=begin("exported"))
     except BackendError as error:
         missing["exported"] = error.message
     if perceptual is None:

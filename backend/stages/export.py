@@ -15,7 +15,7 @@ import numpy as np
 
 from backend.contract.errors import BackendError
 from backend.contract.job import ExportConfig
-from backend.contract.result import VDB_NAME
+from backend.contract.result import vdb_path
 from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame, Particles
 from backend.io.vdb import write_vdb
@@ -123,11 +123,6 @@ def write_sequence(frames: Iterator[VdbFrame], folder: Path) -> Iterator[tuple[i
         path = vdb_path(folder, item.frame)
         write_vdb(path, item.grids, voxel_size=item.voxel_size, origin=item.origin)
         yield item.frame, path
-
-
-def vdb_path(folder: Path, frame: int) -> Path:
-    """Where a frame lies: frame 0 is number 1, as Blender wants it."""
-    return folder / VDB_NAME.format(frame + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from backend.contract.errors import BackendError
-from backend.contract.result import VDB_NAME
+from backend.contract.result import vdb_path
 from backend.io.atomic import whole_file
 from backend.io.vdb import write_vdb
 from synthetic.scenes import SmokeScene
@@ -56,7 +56,7 @@ def record(recording: Recording, folder: Path, *, progress: Callable[[], None]) 
     folder.mkdir(parents=True, exist_ok=True)
     _claim(recording, folder)
     simulation = recording.simulation()
-    if all((folder / VDB_NAME.format(frame + 1)).exists() for frame in range(recording.num_frames)):
+    if all(vdb_path(folder, frame).exists() for frame in range(recording.num_frames)):
         for _ in range(recording.num_frames):
             progress()
         return
@@ -65,7 +65,7 @@ def record(recording: Recording, folder: Path, *, progress: Callable[[], None]) 
         progress()
     kept = time.monotonic()
     while True:
-        path = folder / VDB_NAME.format(frame + 1)
+        path = vdb_path(folder, frame)
         if not path.exists():
             write_frame(path, state, simulation.grid, has_velocity=frame % recording.velocity_every == 0)
         progress()

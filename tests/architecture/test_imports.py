@@ -96,7 +96,7 @@ def backend_problem(found: Import) -> str | None:
         return "grids know nothing of particles"
     if found.is_of("backend.published") and not where.startswith(("backend/stages/", "backend/published/")):
         return "only the stages choose a method"
-    parts = ("backend/physics/", "backend/render/", "backend/geometry/", "backend/fit/", "backend/published/")
+    parts = ("backend/physics/", "backend/render/", "backend/geometry/", "backend/fit/", "backend/published/", "backend/score/")
     if where.startswith(parts) and found.is_of("backend.stages"):
         return "the parts never import what is built of them"
     if where.count("/") > 1 and found.is_of("backend.pipeline"):

@@ -10,6 +10,7 @@ import pytest
 
 from backend.contract.errors import BackendError
 from backend.contract.light import Light
+from backend.contract.result import vdb_path
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -21,7 +22,6 @@ from backend.score.exported import Exported, opacity_decibels
 from backend.score.particles import learned_buoyancy, learned_light, mean_divergence
 from backend.score.proposals import Proposals
 from backend.score.truth_set import Volume
-from backend.stages.export import vdb_path
 
 
 def truth_volume() -> Volume:
