@@ -227,7 +227,7 @@ class WILDSMOKE_PG_export(bpy.types.PropertyGroup):
         name="Voxel Size (m)", description="0 takes the size that the particles carry", default=0.0, min=0.0, max=1e6, precision=4
     )
     max_voxels: IntProperty(
-        name="Voxels at Most", description="Along the longest side of the volume", default=256, min=8, max=2048
+        name="Voxels at Most", description="Along the longest side of the volume", default=128, min=8, max=2048
     )
 
 

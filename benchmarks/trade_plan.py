@@ -74,7 +74,7 @@ _AROUND_PREVIEW = (  # setting, stage, values; that of the preset is added
     ("volume.use_prior", "volume", ("false",)),
     ("volume.stride", "volume", ("1", "6")),
     ("volume.every", "volume", ("1", "6")),
-    ("export.max_voxels", "export", ("64", "128", "384")),
+    ("export.max_voxels", "export", ("64", "96", "256")),
     ("physical.num_particles", "physical", ("400", "6000")),
     ("visual.color", "visual", ("one_hue",)),
 )
@@ -91,7 +91,7 @@ _TOGETHER = {
         {"export.max_voxels": "64"},
         {"volume.use_prior": "false"},
         {"visual.iterations": "6", "visual.num_particles": "1500"},
-        {"frames.working_size": "192", "visual.num_particles": "4000"},
+        {"frames.working_size": "128", "visual.num_particles": "3000"},
         FOLLOWING,
     ),
     "preview": (
@@ -106,7 +106,8 @@ _TOGETHER = {
         {"visual.mass_iterations": "2"},
         {"visual.mass_iterations": "12"},
         {"volume.every": "1"},
-        {"export.max_voxels": "192"},
+        {"export.max_voxels": "128"},
+        {"export.max_voxels": "256"},
         {"frames.working_size": "256"},
         FOLLOWING,
     ),

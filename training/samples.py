@@ -11,6 +11,7 @@ from scipy import ndimage
 from backend.field.rays import optical_depth
 from backend.fit.pace import longest_stride
 from backend.fit.region import PIXELS_A_CELL
+from backend.fit.scene import meeting_point
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 from backend.prior.predict import SHAPE
@@ -21,6 +22,7 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 _CELLS = (0.32, 0.56)  # m, the least and the largest voxel
 _LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
 _SHORTEST = 15  # frames of a clip
+_FOOT_FRAMES = 16  # that the source is looked for in
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
 
@@ -52,13 +54,19 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = Lattice(origin=plume.origin, voxel_size=VOXEL_SIZE, shape=plume.density.shape[1:])  # type: ignore[arg-type]
-    source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
-    if kind == "still":
-        source += draw.normal(0.0, 0.8) * views[0].camera_to_world[:3, 2]  # nothing tells how far away it is
     noise = draw.choice([0.002, 0.01])
 
+    def clear_depth_at(index: int) -> np.ndarray:
+        return optical_depth(plume.density_at(first + index), lattice, views[index], step=1.0)
+
+    if kind == "still":  # nothing tells how far away it is
+        source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
+        source += draw.normal(0.0, 0.8) * views[0].camera_to_world[:3, 2]
+    else:
+        source = meeting_point(clear_depth_at, views, most_frames=_FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
+
     def depth_at(index: int) -> np.ndarray:
-        depth = optical_depth(plume.density_at(first + index), lattice, views[index], step=1.0)
+        depth = clear_depth_at(index)
         opacity = 1 - np.exp(-depth) + noise * draw.standard_normal(depth.shape).astype(np.float32)
         return -np.log1p(-np.clip(opacity, 0.0, 1 - math.exp(-_MOST_DEPTH)))
 

@@ -1,9 +1,10 @@
 """Train the prior on lessons. Goes on where it was interrupted; every tenth plume is held back and scored.
 
-    .venv/backend/bin/python -m training.train --lessons DIR [DIR ..] --out DIR [--passes 20] [--start OTHER/state.pt]
+    .venv/backend/bin/python -m training.train --lessons DIR [DIR ..] --out DIR [--passes 20] [--start OTHER/plumes.npz]
 
 What is scored and ships is the running mean of the weights: after one pass or another the same scene differs more than it gains.
-OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass; OUT/plumes.npz: the weights as they ship.
+OUT/state.pt: all that is needed to go on; OUT/log.jsonl: a line for each pass, and one for what was started from;
+OUT/plumes.npz: the weights as they ship.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torch.nn import functional
 
 from backend.io.atomic import whole_file
 from backend.prior.network import PlumeNet, Sight
-from backend.prior.predict import SHAPE, save_weights
+from backend.prior.predict import SHAPE, read_weights, save_weights
 from backend.prior.window import NUM_CONDITIONS, OFFSETS
 from backend.score.measures import correlation
 
@@ -111,13 +112,20 @@ def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in zip(names, np.nanmean(rows, axis=0), strict=True)}
 
 
+def note(folder: Path, line: dict[str, object]) -> None:
+    """One more line of the log."""
+    print(json.dumps(line), flush=True)
+    with open(folder / "log.jsonl", "a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+
+
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lessons", type=Path, required=True, nargs="+", help="each with lessons of the same plumes")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--passes", type=int, default=20)
     parser.add_argument("--rate", type=float, default=2e-3)
-    parser.add_argument("--start", type=Path, help="a state.pt whose net is taught on, perhaps from other lessons")
+    parser.add_argument("--start", type=Path, help="weights as they ship, which are taught on")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     folders = [sorted(folder.glob("*.npz")) for folder in given.lessons]
@@ -126,8 +134,7 @@ def main(arguments: list[str]) -> int:
     torch.manual_seed(0)
     net = PlumeNet().to(memory_format=torch.channels_last_3d)
     if given.start:
-        state = torch.load(given.start, weights_only=True)
-        take_over(net, state.get("mean", state["net"]))
+        take_over(net, read_weights(given.start)[1])
     mean = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-4)
     first = 0
@@ -137,6 +144,8 @@ def main(arguments: list[str]) -> int:
         mean.load_state_dict(state["mean"])
         optimiser.load_state_dict(state["optimiser"])
         first = state["passes"]
+    elif given.start:
+        note(given.out, {"passes": 0, **score(mean, unseen)})
     num_steps = len(lessons) // _BATCH
     for number in range(first, given.passes):
         begin, sums = time.monotonic(), np.zeros(4)
@@ -156,11 +165,8 @@ def main(arguments: list[str]) -> int:
                 for kept, now in zip(mean.parameters(), net.parameters(), strict=True):
                     kept.lerp_(now, share)
             sums += parts
-        line: dict[str, object] = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
-        line |= {"seconds": round(time.monotonic() - begin, 1), **score(mean, unseen)}
-        print(json.dumps(line), flush=True)
-        with open(given.out / "log.jsonl", "a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        line = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
+        note(given.out, line | {"seconds": round(time.monotonic() - begin, 1), **score(mean, unseen)})
         with whole_file(given.out / "state.pt") as part:
             kept = {"net": net.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
             torch.save({**kept, "passes": number + 1}, part)

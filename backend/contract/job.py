@@ -224,7 +224,7 @@ class ExportConfig:
     """The VDB sequence. voxel_size: m, 0 for the size that the particles carry. max_voxels: of the longest side."""
 
     voxel_size: float = 0.0
-    max_voxels: int = 256
+    max_voxels: int = 128
 
     def __post_init__(self) -> None:
         _check("voxel_size", self.voxel_size, 0.0, 1e6)
@@ -257,9 +257,8 @@ class Config:
 def draft() -> Config:
     """A first look."""
     return Config(
-        frames=FramesConfig(working_size=128),
         physical=PhysicalConfig(num_particles=1000, solver_iterations=2, correction_iterations=2),
-        visual=VisualConfig(num_particles=3000, iterations=3),
+        visual=VisualConfig(num_particles=4000, iterations=3),
         published=PublishedConfig(num_physical=1000, num_particles=4000, physical_iterations=6, visual_iterations=6),
         export=ExportConfig(max_voxels=96),
     )
@@ -277,7 +276,7 @@ def final() -> Config:
         physical=PhysicalConfig(num_particles=4000, solver_iterations=4, correction_iterations=8),
         visual=VisualConfig(num_particles=24000, iterations=16),
         published=PublishedConfig(num_physical=4000, num_particles=24000, physical_iterations=30, visual_iterations=30),
-        export=ExportConfig(max_voxels=384),
+        export=ExportConfig(max_voxels=192),
     )
 
 

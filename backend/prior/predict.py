@@ -73,10 +73,15 @@ class Prior:
         )
 
 
-def _read_net(weights: Path) -> PlumeNet:
+def read_weights(weights: Path) -> tuple[tuple[int, ...], dict[str, torch.Tensor]]:
+    """The network's widths, and its parameters by name, float32."""
     with np.load(weights, allow_pickle=False) as arrays:
         widths = tuple(int(width) for width in arrays["widths"])
-        state = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
+        return widths, {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
+
+
+def _read_net(weights: Path) -> PlumeNet:
+    widths, state = read_weights(weights)
     net = PlumeNet(widths)
     net.load_state_dict(state)
     return net.eval()

@@ -14,13 +14,20 @@ COLUMNS = ("density1", "density2", "sideways2", "up2", "depth2")
 
 
 @pytest.mark.parametrize(
-    ("name", "passes"), [("prior_training", 8), ("prior_training_on", 4), ("prior_training_wind", 5), ("prior_training_short", 5)]
+    ("name", "lines"),
+    [
+        ("prior_training", 8),
+        ("prior_training_on", 4),
+        ("prior_training_wind", 5),
+        ("prior_training_short", 5),
+        ("prior_training_found", 4),  # and one for what was started from
+    ],
 )
-def test_the_page_shows_the_log_of_the_training(name: str, passes: int) -> None:
+def test_the_page_shows_the_log_of_the_training(name: str, lines: int) -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     assert f"docs/results/{name}.jsonl" in page
     log = (CHECKOUT / "docs" / "results" / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
-    assert len(log) == passes
+    assert len(log) == lines
     for line in log:
         entry = json.loads(line)
         cells = " | ".join(f"{entry[name]:.3f}" for name in COLUMNS)

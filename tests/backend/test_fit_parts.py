@@ -194,6 +194,21 @@ def test_a_camera_that_turns_little_finds_the_source_on_its_ray(degrees: float) 
     assert np.linalg.norm(scene.anchor - source) < 0.5
 
 
+def test_rays_refute_a_world_that_begins_elsewhere() -> None:
+    source = np.array([0.4, -0.3, 0.0])
+    angles = np.radians(np.linspace(-115, -65, 9))
+    near = [look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0])) for a in angles]
+    feet = [view_at(cameras(matrices=(matrix,)), 0).project(source[None])[0][0] for matrix in near]
+    layers = [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
+    expected = make_scene(layers, cameras(matrices=tuple(near))).anchor
+    for away in ([0.0, 25.0, 0.0], [0.0, -7.0, 0.0], [3e5, 1e6, -2e5]):
+        moved = tuple(
+            np.vstack([np.column_stack([matrix[:3, :3], matrix[:3, 3] - away]), matrix[3]]) for matrix in map(np.array, near)
+        )
+        anchor = make_scene(layers, cameras(matrices=moved)).anchor + away
+        np.testing.assert_allclose(anchor, expected, atol=0.25)
+
+
 def test_records_take_and_join() -> None:
     layer = layer_of(disc(20.0))
     scene = make_scene([layer], cameras())

@@ -63,6 +63,24 @@ def test_clips_are_short_and_long(recorded: Plume) -> None:
     assert min(spans) >= 7.0, "eight strides at least: what the fit itself sees to"
 
 
+def test_the_source_is_found_in_the_pictures(recorded: Plume) -> None:
+    """As a fit finds it: where the pictures show the foot of the smoke, whatever the scene says of its sources."""
+    count = 0
+    for number in range(16):
+        lesson = draw_lesson(recorded, np.random.default_rng(number))
+        window, (width, height) = lesson.window, lesson.size.astype(int)
+        if np.ptp(window.conditions[len(OFFSETS) : 2 * len(OFFSETS)]) == 0.0:
+            continue  # a camera that stands still: nothing tells how far away it is
+        x, y, w = window.matrices[OFFSETS.index(0)] @ [*window.source, 1.0]
+        column, row = round(float(x / w)), round(float(y / w))
+        image = np.where(window.images[OFFSETS.index(0)] > 0.2, 1, 0)[:height, :width]
+        lowest = int(np.flatnonzero(image.any(axis=1))[-1])
+        assert abs(row - lowest) < 6
+        assert image[max(0, lowest - 4) : lowest + 1, max(0, column - 5) : column + 6].any()
+        count += 1
+    assert count > 8
+
+
 def test_the_same_number_draws_the_same_lesson_and_scene(recorded: Plume) -> None:
     a, b = (draw_lesson(recorded, np.random.default_rng(4)) for _ in range(2))
     assert a.density.tobytes() == b.density.tobytes()
