@@ -112,7 +112,7 @@ def how(results: Mapping[str, Any]) -> str:
     first, stop = next(cell["frames"] for cell in cells if cell["name"] in PRESETS)
     loads = [cell["load"] for cell in cells]
     versions = ", ".join(f"{name} {number}" for name, number in results["versions"].items())
-    codes = " and ".join(sorted({cell["code"] for cell in cells}))
+    codes, weights = (" and ".join(sorted({cell[name][:12] for cell in cells})) for name in ("code", "weights"))
     return (
         f"`python3 wildsmoke.py bench --out DIR --page`: {len(cells)} jobs on the frames {first} to {stop - 1} of "
         f"{' and '.join(scenes)}, which presets are tuned on; the five scenes in full are in [What was measured](results.md). "
@@ -123,7 +123,7 @@ def how(results: Mapping[str, Any]) -> str:
         "the timing of the machine, which is done once. "
         f"Machine: {machine['processor']}, {machine['cores']} cores, {machine['memory_gib']:.0f} GiB, {machine['system']}, "
         f"not quiet (load average {min(loads):.1f} to {max(loads):.1f} at the starts), so that ratios say more than seconds. "
-        f"{versions}; sources {codes}.\n\n"
+        f"{versions}; sources {codes}, the prior's weights {weights}.\n\n"
         "Smoothing length, rest density and time step are no settings: they follow from the particles' spacing.\n"
     )
 
