@@ -21,7 +21,7 @@ CONVENTION = 0.03  # of the distance: how near to the world's origin's depth smo
 FOOT_HEIGHT = 0.05  # of the image
 FOOT_FAINT = 0.02  # of the fullest row: a row with less shows no foot
 FOOT_SHARE = 0.2  # of the most that the foot's rows ever show: in frames with less the source has gone out
-_ROUNDS = 30
+_ROUNDS = 30  # of weights and point; each is settled long before
 _STEEP = 1e-3  # sine of the angle to straight down, below which nothing is level before a camera
 
 
@@ -68,7 +68,7 @@ def is_origin_seen(view: View) -> bool:
 
 
 def meeting_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], *, most_frames: int = 64) -> np.ndarray:
-    """Where the rays through the foot of the smoke meet, in the least-squares sense, over up to `most_frames` frames -> [3] m.
+    """Where the rays through the foot of the smoke most likely meet, by up to `most_frames` frames -> [3] m.
 
     depth_at: frame -> its optical depth [h, w].
 

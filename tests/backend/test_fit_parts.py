@@ -179,33 +179,36 @@ def test_rays_through_the_foot_of_the_smoke_meet_at_its_source(goes_out_at: int)
     np.testing.assert_allclose(make_scene(layers[:1], cameras()).anchor, 0.0, atol=1e-9)
 
 
+def on_an_arc(degrees: float) -> tuple[np.ndarray, ...]:
+    """Nine poses [4, 4] of a camera that goes around the world's origin and looks above it."""
+    angles = np.radians(np.linspace(-90 - 0.5 * degrees, -90 + 0.5 * degrees, 9))
+    return tuple(np.array(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0]))) for a in angles)
+
+
+def plume_from(source: np.ndarray, poses: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """The smoke layers in which a foot stands at `source` [3] m, with more smoke over it."""
+    feet = [view_at(cameras(matrices=(pose,)), 0).project(source[None])[0][0] for pose in poses]
+    return [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
+
+
 @pytest.mark.parametrize("degrees", [0.5, 8.0, 20.0])
 def test_a_camera_that_turns_little_finds_the_source_on_its_ray(degrees: float) -> None:
     """Not at the height that the camera looks at; as far away as the rays and the world's origin say together."""
-    source = np.array([0.4, -0.3, 0.0])
-    angles = np.radians(np.linspace(-90 - 0.5 * degrees, -90 + 0.5 * degrees, 9))
-    matrices = tuple(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0])) for a in angles)
-    given = cameras(matrices=matrices)
-    feet = [view_at(given, index).project(source[None])[0][0] for index in range(9)]
-    layers = [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
-    scene = make_scene(layers, given)
+    source, poses = np.array([0.4, -0.3, 0.0]), on_an_arc(degrees)
+    scene = make_scene(plume_from(source, poses), cameras(matrices=poses))
     seen = scene.views[4].project(scene.anchor[None])[0][0]
     assert np.linalg.norm(seen - scene.views[4].project(source[None])[0][0]) < 3.5  # px; the foot is not all in the lowest row
     assert np.linalg.norm(scene.anchor - source) < 0.5
 
 
 def test_rays_refute_a_world_that_begins_elsewhere() -> None:
-    source = np.array([0.4, -0.3, 0.0])
-    angles = np.radians(np.linspace(-115, -65, 9))
-    near = [look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0])) for a in angles]
-    feet = [view_at(cameras(matrices=(matrix,)), 0).project(source[None])[0][0] for matrix in near]
-    layers = [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
-    expected = make_scene(layers, cameras(matrices=tuple(near))).anchor
+    source, poses = np.array([0.4, -0.3, 0.0]), on_an_arc(50.0)
+    layers = plume_from(source, poses)
+    expected = make_scene(layers, cameras(matrices=poses)).anchor
     for away in ([0.0, 25.0, 0.0], [0.0, -7.0, 0.0], [3e5, 1e6, -2e5]):
-        moved = tuple(
-            np.vstack([np.column_stack([matrix[:3, :3], matrix[:3, 3] - away]), matrix[3]]) for matrix in map(np.array, near)
-        )
-        anchor = make_scene(layers, cameras(matrices=moved)).anchor + away
+        shift = np.eye(4)
+        shift[:3, 3] = np.negative(away)
+        anchor = make_scene(layers, cameras(matrices=tuple(shift @ pose for pose in poses))).anchor + away
         np.testing.assert_allclose(anchor, expected, atol=0.25)
 
 
