@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from backend import __version__
 from backend.contract.errors import BackendError
 from backend.contract.job import PRESETS, preset_config
+from backend.contract.result import PARTICLES_FILE, RESULT_FILE, VDB_FOLDER
 from backend.contract.truth import TRUTH_FILE, TRUTH_FOLDER
 from backend.io.atomic import write_text
 from backend.prior.weights import weights_fingerprint
@@ -39,6 +40,7 @@ from benchmarks.trade_plan import FRAMES, Sweep, Trial, compared, sweeps, with_d
 
 SCENES = ("puff_front", "steady_plume")  # two of the three that presets are tuned on: a thin front and a thick plume
 RESULTS_FILE = "trade.json"
+EXPORTED = (PARTICLES_FILE, VDB_FOLDER, RESULT_FILE)  # never taken over: what is left of it would make another export look cheap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,7 +183,7 @@ def make(cell: Cell) -> None:
     if donor is not None:
         if not donor.job.is_dir():
             make(donor)
-        shutil.copytree(donor.job, cell.job)
+        shutil.copytree(donor.job, cell.job, ignore=shutil.ignore_patterns(*EXPORTED))
     run(cell, cell.record)
     if donor is not None or cell.trial.repeat:
         shutil.rmtree(cell.job)
@@ -221,10 +223,25 @@ def compare_trivial(root: Path, scenes: Sequence[Path], frames: tuple[int, int])
             run_module("benchmarks.trade_score", scene, *options)
 
 
+def with_shared_costs(cells: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Stages that a cell took over cost what its donor's record says, also where that was measured again."""
+    names = [field.name for field in fields(Trial)]
+    stages = {(cell["scene"], cell["name"]): cell["stages"] for cell in cells}
+    found = []
+    for cell in cells:
+        facts = {name: cell[name] for name in names}
+        changes = tuple((key, value) for key, value in cell["changes"])
+        donor = Trial(**{**facts, "changes": changes, "frames": tuple(cell["frames"])}).donor
+        theirs = stages.get((cell["scene"], donor.name), {}) if donor else {}
+        taken = [name for name, stage in cell["stages"].items() if stage["is_taken_over"] and name in theirs]
+        found.append({**cell, "stages": {**cell["stages"], **{name: {**theirs[name], "is_taken_over": True} for name in taken}}})
+    return found
+
+
 def gather(root: Path, swept: Sequence[Sweep]) -> dict[str, Any]:
     """All cells of a folder, on which machine, with which versions and settings."""
     cells = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((root / "cells").glob("*/*.json"))]
-    cells = [{**cell, **totals(cell["stages"])} for cell in cells]
+    cells = [{**cell, **totals(cell["stages"])} for cell in with_shared_costs(cells)]
     versions = {"wildsmoke": __version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
     plan = [
         {

@@ -72,7 +72,7 @@ _AROUND_PREVIEW = (  # setting, stage, values; that of the preset is added
     ("frames.working_size", "", ("128", "256", "320")),
     ("visual.mass_iterations", "visual", ("2", "4", "8")),
     ("volume.use_prior", "volume", ("false",)),
-    ("volume.stride", "volume", ("1", "6")),
+    ("volume.stride", "volume", ("1", "3", "12")),
     ("volume.every", "volume", ("1", "6")),
     ("export.max_voxels", "export", ("64", "96", "256")),
     ("physical.num_particles", "physical", ("400", "6000")),

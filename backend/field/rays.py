@@ -41,8 +41,8 @@ def optical_depth_adjoint(image: np.ndarray, lattice: Lattice, view: View, *, st
 
 
 def at_voxels(image: np.ndarray, lattice: Lattice, view: View, *, outside: float = 0.0) -> np.ndarray:
-    """[H, W] -> [X, Y, Z] float32: the image, bilinear between pixel centres, where each voxel's centre is seen; `outside`
-    where it is not in the picture or not before the camera."""
+    """[H, W] -> [X, Y, Z] float32: the image where each voxel's centre is seen, bilinear between pixel centres; beside the
+    outermost lie pixels of `outside`, the answer also for what is further beside the picture or not before the camera."""
     if image.shape != (view.height, view.width):
         raise ValueError(f"an image of {image.shape} does not fit a view of {view.width}x{view.height}")
     found = np.empty(lattice.shape, np.float32)
@@ -162,6 +162,13 @@ def _spread(image, origin, h, camera, step, density):
                                 density[i + a, j + b, k + 1] += wy * fz
 
 
+@njit(cache=True, inline="always")
+def _pixel(image, row, column, outside):
+    if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
+        return image[row, column]
+    return outside
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def _look_up(image, origin, h, camera, outside, found):
     height, width = image.shape
@@ -176,12 +183,10 @@ def _look_up(image, origin, h, camera, outside, found):
                     continue
                 column = camera[12] * (camera[0] * dx + camera[3] * dy + camera[6] * dz) / depth + camera[14] - 0.5
                 row = camera[13] * (camera[1] * dx + camera[4] * dy + camera[7] * dz) / depth + camera[15] - 0.5
-                if not (-0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5):
+                if not (-1.0 < column < width and -1.0 < row < height):
                     continue
                 c, r = math.floor(column), math.floor(row)
                 fc, fr = column - c, row - r
-                c0, c1 = max(c, 0), min(c + 1, width - 1)
-                r0, r1 = max(r, 0), min(r + 1, height - 1)
-                upper = (1.0 - fc) * image[r0, c0] + fc * image[r0, c1]
-                lower = (1.0 - fc) * image[r1, c0] + fc * image[r1, c1]
+                upper = (1.0 - fc) * _pixel(image, r, c, outside) + fc * _pixel(image, r, c + 1, outside)
+                lower = (1.0 - fc) * _pixel(image, r + 1, c, outside) + fc * _pixel(image, r + 1, c + 1, outside)
                 found[i, j, k] = (1.0 - fr) * upper + fr * lower

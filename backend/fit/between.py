@@ -18,7 +18,7 @@ def between(before: Proposal, after: Proposal, stand: Stand, *, share: float, se
     for proposal, weight, ahead in ((before, 1.0 - share, share * seconds), (after, share, (share - 1.0) * seconds)):
         own = proposal.stand
         origins = points - ahead * own.at(proposal.velocity, points, outside="nearest")
-        density += np.float32(weight) * own.at(proposal.density, origins, outside="constant")
+        density += np.float32(weight) * own.at(proposal.density, origins, outside="grid-constant")
         velocity += np.float32(weight) * own.at(proposal.velocity, origins, outside="nearest")
     shape = stand.lattice.shape
     return Proposal(stand=stand, density=density.reshape(shape), velocity=velocity.reshape(*shape, 3))

@@ -1,8 +1,7 @@
 """Particles brought to the density of a volume: moved first, then made heavier or lighter; newborn ones at its depth.
 
-What the volume proposes for one frame is right in the mean and blurred; what particles bring along is sharp and drifts. Each
-step goes a share of the way: more follows whole clips closer, less is calmer where a short clip lets the volume flicker.
-Densities are compared on the volume's own voxels, both blurred by what a particle covers.
+What the volume proposes for one frame is right in the mean and blurred; what particles bring along is sharp and drifts.
+Densities are compared on the volume's own voxels, each particle shared among the eight around it.
 """
 
 from __future__ import annotations
@@ -14,13 +13,12 @@ from backend.fit.guide import Guide
 from backend.geometry.camera import View
 
 FOLLOW_PLACES = 0.8  # share of the flow that turns the particles' density into the volume's, a frame
-FOLLOW_MASSES = 0.4  # share of the way to the masses that the volume asks for (in the logarithm), a frame
-_BLUR = 0.8  # voxels: what one particle is spread over before it is compared with the volume
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away
 _PRECISION = 0.002  # of the potential; with ten times that a rounding that ends it a step earlier can be seen in the pictures
 _MOST_ITERATIONS = 60
-MOST_RATIO = 4.0  # of masses, and its inverse
+MOST_RATIO = 4.0  # of masses, and its inverse, in one of
+_ROUNDS = 3  # of masses
 
 
 class Balance:
@@ -30,8 +28,8 @@ class Balance:
         self.guide = guide
         self.places = guide.places(positions)  # [3, N] voxels
         volume = guide.lattice.voxel_size**3
-        self.carried = _blurred(deposited(self.places, masses, guide.lattice.shape) / volume)  # [X, Y, Z] 1/m
-        self.wanted = _blurred(guide.density)
+        self.carried = (deposited(self.places, masses, guide.lattice.shape) / volume).astype(np.float32)  # [X, Y, Z] 1/m
+        self.wanted = guide.density
 
     def displacement(self) -> np.ndarray:
         """[N, 3] m: the shortest flow that turns the carried density into the wanted one, both of one total.
@@ -103,9 +101,11 @@ def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.nd
 
 
 def drawn_level(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:
-    """Masses [N] m^2 at positions [N, 3] m, a share of the way to the volume's density; of the type that they had."""
+    """Masses [N] m^2 at positions [N, 3] m brought to the volume's density; of the type that they had."""
     exact = masses.astype(np.float64)
-    return (exact * Balance(guide, positions, exact).ratios() ** FOLLOW_MASSES).astype(masses.dtype)
+    for _ in range(_ROUNDS):
+        exact = exact * Balance(guide, positions, exact).ratios()
+    return exact.astype(masses.dtype)
 
 
 def points_on_rays(guide: Guide, view: View, pixels: np.ndarray, otherwise: np.ndarray, *, seed: int) -> np.ndarray:
@@ -143,10 +143,6 @@ def deposited(places: np.ndarray, masses: np.ndarray, shape: tuple[int, ...]) ->
         flat = np.ravel_multi_index(tuple(index[:, inside]), shape)
         total += np.bincount(flat, weight[inside], minlength=total.size)
     return total.reshape(shape)
-
-
-def _blurred(values: np.ndarray) -> np.ndarray:
-    return ndimage.gaussian_filter(np.asarray(values, np.float32), _BLUR, mode="constant")
 
 
 def _looked_up(values: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ class Guide:
 
     def density_at(self, points: np.ndarray) -> np.ndarray:
         """[N] 1/m; zero outside the grid."""
-        return self.stand.at(self.density, points, outside="constant")
+        return self.stand.at(self.density, points, outside="grid-constant")
 
     def velocity_at(self, points: np.ndarray) -> np.ndarray:
         """[N, 3] m/s; outside the grid that of its nearest voxel."""

@@ -21,6 +21,7 @@ from backend.prior.predict import SHAPE, Proposal
 from backend.prior.window import Stand
 
 _UPDATES = 6
+_AS_IT_IS = 1e-3  # weight of a sighting that would leave each voxel as it stands
 _REACH = 15  # strides to either side that count
 _APART = 5  # strides between the moments at which it is found
 _WIDE = 28  # voxels of its grid along x and y: all that the cameras' grids cover but their corners
@@ -42,13 +43,13 @@ def lasting(density: np.ndarray, lattice: Lattice, sightings: Sequence[Sighting]
     image shows stay as they are.
     """
     shown = [sighting.weight * at_voxels(np.ones_like(sighting.depth), lattice, sighting.view) for sighting in sightings]
-    share = np.sum(shown, axis=0)
+    share = np.sum(shown, axis=0) + _AS_IT_IS
     for _ in range(_UPDATES):
-        total = np.zeros_like(share)
+        total = np.full_like(share, _AS_IT_IS)
         for sighting in sightings:
             ratio = ratio_to(sighting.depth, density, lattice, sighting.view)
             total += np.float32(sighting.weight) * at_voxels(ratio, lattice, sighting.view)
-        density = density * np.where(share > 0.0, total / np.maximum(share, 1e-6), 1.0)
+        density = density * (total / share)
     return density
 
 
@@ -85,7 +86,7 @@ class Lasting:
             if weight <= 0.0:
                 continue
             proposal = self.proposal_at(index)
-            guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="constant")
+            guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="grid-constant")
             sightings.append(Sighting(depth=self.region.depths[frame], view=self.region.views[frame], weight=weight))
         total = sum(sighting.weight for sighting in sightings)
         floor = 1e-6 * float(guess.max(initial=0.0))

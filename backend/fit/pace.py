@@ -10,7 +10,7 @@ from backend.fit.region import Region
 _PAIRS = 12  # of frames that are looked at
 _CLEAR = 0.7  # px that smoke should move between two frames for its motion to be told
 _LONGEST = 16  # frames between them
-_STRIDES = 8  # at least, in a clip
+_STRIDES = 4  # at least, in a clip
 _STEP = 0.9  # voxels that smoke should move in a stride
 
 
@@ -23,8 +23,8 @@ def stride_of(region: Region) -> int:
 
 
 def longest_stride(num_frames: int) -> int:
-    """Of a clip, in frames."""
-    return max(1, num_frames // _STRIDES)
+    """Of a clip, in frames: some fit in, and over each of them motion can be measured."""
+    return int(np.clip(num_frames // _STRIDES, 1, _LONGEST))
 
 
 def _metres_a_frame(region: Region) -> float:

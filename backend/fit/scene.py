@@ -90,7 +90,8 @@ def meeting_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], 
         view, foot = views[frame], depth_at(frame)[rows].astype(np.float64)
         row, column = np.mgrid[rows, 0 : foot.shape[1]]
         pixel = np.array([(foot * column).sum(), (foot * row).sum()]) / foot.sum() + 0.5
-        ray = view.unproject(pixel[None], np.ones(1))[0] - view.position
+        across = (pixel - (view.cx, view.cy)) / (view.fx, view.fy)
+        ray = view.camera_to_world[:3, :3] @ np.array([*across, 1.0])
         places.append(view.position)
         projectors.append(np.eye(3) - np.outer(ray, ray) / (ray @ ray))
     return _most_likely(np.array(places), np.array(projectors), views)

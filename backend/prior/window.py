@@ -57,7 +57,7 @@ class Stand:
     def at(self, values: np.ndarray, points: np.ndarray, *, outside: str) -> np.ndarray:
         """Values of the voxels, [X, Y, Z] or [X, Y, Z, C], at world points [N, 3] m, trilinear -> [N] or [N, C].
 
-        outside: "constant" for zero, "nearest" for the nearest voxel's.
+        outside: "grid-constant" for zero one voxel beyond the outermost and further, "nearest" for the nearest voxel's.
         """
         places = self.voxels(points).T
         if values.ndim == 3:

@@ -77,8 +77,24 @@ def test_voxels_look_up_the_pixel_they_project_to(view: View) -> None:
     inside = ((pixels > low) & (pixels < high)).all(-1) & (depth.reshape(LATTICE.shape) > 0)
     assert inside.sum() > 100
     assert np.abs(found[inside] - pixels[inside]).max() < 1e-3
-    outside = ((pixels < 0) | (pixels > high + 0.5)).any(-1)
+    outside = ((pixels < -0.5) | (pixels > high + 1.0)).any(-1)
     assert (found[outside] == -1.0).all()
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_voxel_that_leaves_the_picture_fades(axis: int) -> None:
+    """No step that rounding could take: the value falls to that of outside over one pixel."""
+    view = VIEWS[0]
+    way = np.linspace(-12.0, 12.0, 4001)
+    origins = np.zeros((len(way), 3))
+    origins[:, axis] = way
+    image = np.full((view.height, view.width), 3.0, np.float32)
+    points = [Lattice(origin=tuple(origin), voxel_size=0.2, shape=(1, 1, 1)) for origin in origins]  # type: ignore[arg-type]
+    found = np.array([rays.at_voxels(image, point, view, outside=1.0)[0, 0, 0] for point in points])
+    pixels, _ = view.project(origins)
+    moved = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+    assert found.min() == 1.0 and found.max() == 3.0
+    assert (np.abs(np.diff(found)) <= 2.0 * moved + 1e-5).all()
 
 
 def test_what_is_behind_the_camera_is_not_looked_up() -> None:

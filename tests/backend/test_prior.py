@@ -54,6 +54,17 @@ def test_the_grid_stands_level_before_its_camera() -> None:
     np.testing.assert_allclose(stand.voxels(np.array([1.0, 2.0, 3.0])), 7.5, atol=1e-12)
 
 
+@pytest.mark.parametrize(("outside", "beyond"), [("grid-constant", 0.0), ("nearest", 1.0)])
+def test_values_of_the_outermost_voxels_do_not_hang_on_rounding(outside: str, beyond: float) -> None:
+    """Grids that share a wall look each other's values up right on it."""
+    stand = stand_before(view(7), np.array([1.0, 2.0, 3.0]), voxel_size=0.5, shape=SMALL)
+    low = stand.centres().reshape(-1, 3)[0]
+    inward = stand.centres().reshape(-1, 3)[-1] - low
+    points = low + np.array([-1e-9, 0.0, 1e-9, -1.0])[:, None] * inward
+    found = stand.at(np.ones(SMALL, np.float32), points, outside=outside)
+    np.testing.assert_allclose(found, [1.0, 1.0, 1.0, beyond], atol=1e-6)
+
+
 def test_lookups_agree_with_the_projection_of_views() -> None:
     """seen_at is the torch way to what backend.field.rays looks up voxel by voxel."""
     window = window_at(20)

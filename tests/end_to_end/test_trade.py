@@ -115,6 +115,22 @@ def test_a_job_that_was_interrupted_is_begun_again(made: Path, monkeypatch: pyte
     assert asked[2:] == ["draft seed=1"], "the donor's job is there"
 
 
+def test_an_export_is_never_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the donor's export left would do half the work of another one."""
+    found: dict[str, set[str]] = {}
+
+    def note(cell: trade.Cell, record: Path) -> None:
+        found[cell.trial.name] = {path.name for path in cell.job.iterdir()} if cell.job.exists() else set()
+        (cell.job / "vdb").mkdir(parents=True, exist_ok=True)
+        for name in ("particles.h5", "result.json", "timing.json"):
+            (cell.job / name).touch()
+
+    monkeypatch.setattr(trade, "run", note)
+    trial = Trial(preset="draft", changes=(("export.max_voxels", "32"),))
+    trade.make(trade.Cell(root=tmp_path, scene=Path("helix"), trial=trial))
+    assert found == {"draft": set(), "draft export.max_voxels=32": {"timing.json"}}
+
+
 def test_kernels_are_compiled_before_anything_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[trade.Cell] = []
 
