@@ -42,7 +42,7 @@ class TimeLeft:
             self._first = min(step, total)
             self._wanted *= 1.0 - self._first / total if total > 0 else 1.0
         elapsed, to_do = now - self._began, total - self._first
-        share = (step - self._first) / to_do if to_do > 0 else 1.0
+        share = min(max((step - self._first) / to_do, 0.0), 1.0) if to_do > 0 else 1.0  # steps that are done anew count as none
         by_pace = elapsed * (1.0 - share) / share if share > 0.0 else None
         if self._stage not in self._ahead:
             return by_pace, None

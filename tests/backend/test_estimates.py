@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from backend.contract.estimates import Estimate, Quality, kept_estimate, quality_text, read_estimate, spoken
@@ -289,6 +289,7 @@ steps = st.lists(st.tuples(st.integers(0, 50), st.integers(0, 50), st.floats(0.0
 
 
 @given(steps)
+@example([(19, 38, 0.0), (0, 38, 0.0)])  # a step is done anew before any time has passed
 def test_it_is_never_negative_nor_absurd(taken) -> None:
     left, now = TimeLeft(ESTIMATED), 0.0
     for name in ESTIMATED:
