@@ -36,13 +36,6 @@ def cell(name: str, cost: float = 20.0, *, scene: str = "a", seed: int = 0, **sc
 
 
 # Presets that were found to be beaten and wait for better settings; strict, so that they are taken off here once they have them.
-WAITING = {
-    name: pytest.mark.xfail(strict=True, reason=reason)
-    for name, reason in {
-        "draft": "measured while the machine was busy, unlike `preview` at 128 px, which so looks no dearer than it",
-        "preview": "measured while the machine was busy, unlike itself at 256 px, which so looks cheaper",
-    }.items()
-}
 NOISE = {"unseen_db": 0.01, "input_smoke_db": 0.01, "vdb_opacity_db": 0.01, "density_correlation": 0.0001, front.COST: 0.001}
 
 
@@ -76,7 +69,7 @@ def beaten(name: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=WAITING.get(name, ())) for name in PRESETS])
+@pytest.mark.parametrize("name", PRESETS)
 def test_no_preset_is_dominated(name: str) -> None:
     """A preset is a promise: nothing that was measured is nowhere worse and somewhere better, by more than noise."""
     assert not beaten(name)
