@@ -192,7 +192,7 @@ class WILDSMOKE_PG_visual(bpy.types.PropertyGroup):
         items=(
             ("auto", "Automatic", "Look at the clip which will do"),
             ("full", "Full", "Three channels for each particle"),
-            ("one_hue", "One Hue", "The clip's one hue, brighter or darker; takes two thirds of the time"),
+            ("one_hue", "One Hue", "The clip's one hue, brighter or darker; a little faster"),
         ),
         default="auto",
     )

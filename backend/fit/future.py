@@ -1,4 +1,4 @@
-"""What the last frames of a fit tell of the next ones: how each parcel goes on, which are doubtful, how far to trust it.
+"""What the last frames of a fit tell of the next ones: how each parcel goes on, how far to trust it.
 
 Smoke goes on as it went: a parcel keeps the velocity that it had. Over the seconds that a forecast is good for that was
 better than a fluid under pressure and buoyancy, for what those do to a field that is known only roughly is rougher still.
@@ -7,27 +7,19 @@ better than a fluid under pressure and buoyancy, for what those do to a field th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from backend.contract.job import ForecastConfig
-from backend.fit import explain
 from backend.fit.carry import as_fluid
 from backend.fit.guide import Guide
-from backend.fit.refine import as_gaussians
-from backend.fit.scene import optical_depth
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
-from backend.geometry.camera import View
-from backend.physics.fluid import number_density
 from backend.physics.interpolate import interpolate_velocity
-from backend.render import splat as renderer
 
 RECENT = 4  # frames whose velocities are averaged: one alone holds the correction of its own picture
 DOUBT = 0.8  # of a parcel's way: measured with true velocities on the tuning scenes, 0.5 to 1.1 in each
-_REWEIGHTINGS = 6  # of what stays, to the last picture
-_SHARPNESS = 2.0  # power of a parcel's density against the usual one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,24 +73,3 @@ def recent_velocity(
         if volumes is not None and len(volumes) >= len(fluid):
             found.append(Guide(volumes[len(fluid) - back]).velocity_at(points))
     return np.mean(found, axis=0)
-
-
-def gathered_masses(
-    record: VisualRecord,
-    layer: np.ndarray,  # [H, W, 4] premultiplied linear RGB and opacity of the record's frame
-    view: View,
-    *,
-    length: float,  # m, within which parcels are near each other
-) -> np.ndarray:  # [N] float32 m^2
-    """Optical masses that show the same picture with less in parcels that hardly others are near to.
-
-    One view does not tell where on a ray smoke is, and what the fit has scattered in depth drifts off on its own. Dense
-    smoke on the same rays takes over: (d / (d + median))^2 of each mass, then multiplicative updates (Richardson 1972).
-    """
-    if len(record.positions) == 0:
-        return record.optical_masses
-    density = number_density(record.positions, length)
-    share = (density / (density + np.median(density))) ** _SHARPNESS
-    thinned = replace(record, optical_masses=(share * record.optical_masses).astype(np.float32))
-    splat = renderer.forward(as_gaussians(thinned), view)
-    return explain.fit_masses(splat, thinned.optical_masses, optical_depth(layer), iterations=_REWEIGHTINGS, consistency=0.0)[1]

@@ -7,7 +7,6 @@ grows; and what moves widens with the way that it has gone. Near frames move, fa
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from backend.contract.cameras import Cameras
 from backend.contract.job import ForecastConfig, PublishedConfig
-from backend.fit.future import Trust, gathered_masses, recent_velocity, trust_of
+from backend.fit.future import Trust, recent_velocity, trust_of
 from backend.fit.population import PER_PARTICLE, is_near_image, take
 from backend.fit.replay import births_at_foot, born_again
 from backend.fit.scene import make_scene
@@ -25,7 +24,6 @@ from backend.published import future as published_future
 from backend.reporting import Report
 
 _REPLAYED = 8  # frames whose births the source repeats: a source that is dying must not live up again
-_EASE = 3.0  # frames in which masses go most of the way to the gathered ones, so that nothing jumps
 
 
 def run(
@@ -52,20 +50,14 @@ def run(
         return
     last = seen[len(seen) - 1]
     trust = trust_of(last, config)
-    length = float(fluid[len(fluid) - 1].smoothing_length)
-    gathered = gathered_masses(last, layers[len(layers) - 1], view, length=length)
     still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
     moving = _going_on(replace(last, next_id=2 * last.next_id), fluid, volumes)
     births = [_going_on(newborn, fluid, volumes) for newborn in births_at_foot(seen)[-_REPLAYED:]]
-    wanted = gathered
     for step in range(config.num_frames):
         report.progress(step, config.num_frames)
         moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
         moving = born_again(moving, births, step)
-        wanted = np.concatenate([wanted, moving.optical_masses[len(wanted) :]])
-        is_near = is_near_image(moving.positions, view)
-        moving, wanted = _eased(take(moving, is_near), wanted[is_near]), wanted[is_near]
-        still = _eased(still, gathered)
+        moving = take(moving, is_near_image(moving.positions, view))
         yield _expected(moving, still, trust, seconds * (step + 1))
     report.progress(config.num_frames, config.num_frames)
 
@@ -78,12 +70,6 @@ def deviations(last: VisualRecord, config: ForecastConfig, *, seconds: float) ->
 
 def _going_on(record: VisualRecord, fluid: Series[PhysicalRecord], volumes: Series[VolumeRecord] | None) -> VisualRecord:
     return replace(record, velocities=recent_velocity(record.positions, fluid, volumes).astype(np.float32))
-
-
-def _eased(record: VisualRecord, wanted: np.ndarray) -> VisualRecord:
-    """Masses one frame further on their way to the wanted ones [N] m^2."""
-    step = np.float32(1.0 - math.exp(-1.0 / _EASE))
-    return replace(record, optical_masses=record.optical_masses + step * (wanted - record.optical_masses))
 
 
 def _expected(moving: VisualRecord, still: VisualRecord, trust: Trust, seconds: float) -> VisualRecord:

@@ -1,4 +1,4 @@
-"""The forecast: parcels that go on as they went, how far they are trusted, what gathers, and clips with little in them."""
+"""The forecast: parcels that go on as they went, how far they are trusted, and clips with little in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from backend.contract.cameras import Cameras
 from backend.contract.errors import Cancelled
 from backend.contract.job import ForecastConfig, PublishedConfig
-from backend.fit.future import DOUBT, RECENT, Trust, gathered_masses, recent_velocity, trust_of
+from backend.fit.future import DOUBT, RECENT, Trust, recent_velocity, trust_of
 from backend.fit.scene import make_scene
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.published import future as published_future
@@ -241,33 +241,6 @@ def test_a_parcel_keeps_its_id(config: ForecastConfig) -> None:
         np.testing.assert_array_equal(before.colors[was], after.colors[now])
         way = np.linalg.norm(after.positions[now] - before.positions[was], axis=1)
         assert way.max() <= 1.01 * np.linalg.norm(MOVING) / FPS  # no id that jumps to another parcel
-
-
-# -- what gathers --------------------------------------------------------------------------------------------------------
-
-
-def test_smoke_on_its_own_gives_way_to_dense_smoke_on_its_ray() -> None:
-    record = visual(np.concatenate([cloud(200, size=0.3), [[0.0, 4.0, 0.0]]]))
-    before = picture(particle_frame(record), VIEW)
-    masses = gathered_masses(record, before, VIEW, length=0.8)
-    assert masses[-1] < 0.3 * record.optical_masses[-1]
-    after = picture(particle_frame(replace(record, optical_masses=masses)), VIEW)
-    assert decibels(squared_errors(after, before)[0]) > 38.0
-
-
-def test_smoke_that_alone_explains_its_pixels_stays() -> None:
-    record = visual(np.concatenate([cloud(200, size=0.3), [[1.8, 0.0, 1.5]]]))
-    masses = gathered_masses(record, picture(particle_frame(record), VIEW), VIEW, length=0.8)
-    assert masses[-1] > 0.6 * record.optical_masses[-1]
-
-
-@pytest.mark.parametrize("positions", [np.zeros((0, 3)), np.zeros((1, 3)), np.zeros((6, 3)), np.array([[1e6, 0.0, 0.0]])])
-def test_gathering_of_little_is_finite(positions: np.ndarray) -> None:
-    record = visual(positions)
-    masses = gathered_masses(record, picture(particle_frame(record), VIEW), VIEW, length=0.8)
-    assert masses.shape == (len(positions),)
-    assert np.isfinite(masses).all()
-    assert (masses >= 0.0).all()
 
 
 # -- clips with little in them ---------------------------------------------------------------------------------------------

@@ -173,6 +173,7 @@ def test_the_stage_and_what_follows_it(table, prior: Prior):
         happens="the same pictures", measure="mean difference of opacities", worst=max(off(2.0**-13), off(2.0**13)), bound=1e-3,
     )  # fmt: skip
     table.row(
-        "scale of such a fit", tried="1e-4 to 1e4 of 10 m", happens="the same pictures, but for rounding that grows with the frames",
-        measure="mean difference of opacities", worst=max(off(scale) for scale in (1e-4, 1e-2, 10.0, 1e4)), bound=0.01,
+        "scale of such a fit", tried="1e-4 to 1e4 of 10 m",
+        happens="the same pictures, but for rounding that grows with the frames", measure="mean difference of opacities",
+        worst=max(off(scale) for scale in (1e-4, 1e-2, 10.0, 1e4)), bound=0.01,
     )  # fmt: skip
