@@ -45,14 +45,14 @@ class Balance:
         potential = weighted_poisson(weight.astype(np.float64), (self.carried - wanted).astype(np.float64))
         steps = np.moveaxis(np.array(np.gradient(potential)), 0, -1)
         steps /= np.maximum(np.linalg.norm(steps, axis=-1, keepdims=True), 1.0)
-        moved = np.stack([_looked_up(steps[..., axis], self.places) for axis in range(3)], axis=1)
+        moved = np.stack([_looked_up(steps[..., axis], self.places, outside=0.0) for axis in range(3)], axis=1)
         return self.guide.lattice.voxel_size * moved @ self.guide.stand.from_world[:3, :3]
 
     def ratios(self) -> np.ndarray:
         """[N]: how many times its mass the volume asks of each particle, within MOST_RATIO."""
         floor = _FLOOR * max(float(self.wanted.max(initial=0.0)), 1e-12)
         ratio = (self.wanted + floor) / (self.carried + floor)
-        return np.clip(_looked_up(ratio, self.places), 1.0 / MOST_RATIO, MOST_RATIO)
+        return np.clip(_looked_up(ratio, self.places, outside=1.0), 1.0 / MOST_RATIO, MOST_RATIO)
 
 
 def weighted_poisson(weight: np.ndarray, divergence: np.ndarray) -> np.ndarray:
@@ -145,5 +145,7 @@ def deposited(places: np.ndarray, masses: np.ndarray, shape: tuple[int, ...]) ->
     return total.reshape(shape)
 
 
-def _looked_up(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return ndimage.map_coordinates(values, places, order=1, mode="nearest")
+def _looked_up(values: np.ndarray, places: np.ndarray, *, outside: float) -> np.ndarray:
+    """Values [X, Y, Z] at places [3, N] voxels -> [N]; `outside` from one voxel beyond the outermost on, where a volume says
+    nothing: particles there are not counted, so that growing for its sake they would grow without end."""
+    return ndimage.map_coordinates(values, places, order=1, mode="grid-constant", cval=outside)

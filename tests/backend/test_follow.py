@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.fit.follow import MOST_RATIO, Balance, deposited, points_on_rays, weighted_poisson
+from backend.fit.follow import MOST_RATIO, Balance, deposited, drawn_level, points_on_rays, weighted_poisson
 from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
@@ -43,6 +43,20 @@ def test_masses_are_shared_and_kept() -> None:
     middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
     np.testing.assert_allclose(middle, (places * masses).sum(axis=1) / masses.sum(), atol=1e-9)
     assert deposited(np.full((3, 1), 40.0), np.ones(1), (8, 8, 8)).sum() == 0.0
+
+
+def test_beside_the_grid_nobody_moves_or_grows() -> None:
+    """A volume full to its walls lacks what is beside them, for that is not counted: it must not be asked for."""
+    guide = guide_of(MIDDLE, size=20.0)
+    corner = STAND.centres()[-1, -1, -1]
+    outward = (corner - STAND.centres()[-2, -2, -2]) / 0.5  # voxels along each axis
+    points = corner + 0.5 * np.array([[0.0], [1.5], [30.0]]) * outward
+    masses = np.full(3, 1e-9)
+    balance = Balance(guide, points, masses)
+    assert balance.ratios()[0] == pytest.approx(MOST_RATIO)
+    np.testing.assert_array_equal(balance.ratios()[1:], 1.0)
+    np.testing.assert_array_equal(balance.displacement()[1:], 0.0)
+    np.testing.assert_array_equal(drawn_level(guide, points, masses)[1:], masses[1:])
 
 
 def test_the_volume_asks_for_what_particles_lack() -> None:
