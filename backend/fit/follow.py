@@ -17,8 +17,8 @@ _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away
 _PRECISION = 0.002  # of the potential; with ten times that a rounding that ends it a step earlier can be seen in the pictures
 _MOST_ITERATIONS = 60
-MOST_RATIO = 4.0  # of masses, and its inverse, in one of
-_ROUNDS = 3  # of masses
+MOST_RATIO = 4.0  # by which a mass grows or shrinks in a round
+_ROUNDS = 3  # in which masses follow, a frame
 
 
 class Balance:
