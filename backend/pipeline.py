@@ -225,7 +225,9 @@ class Pipeline:
             if plan is None:
                 write_records(self.folder.volume, mark, ())
             else:
-                _keep(parts, volume.propose(plan, report, prior=Prior(self.weights), done=parts))
+                prior = Prior(self.weights)
+                plan = volume.centred(plan, report, prior=prior, num_done=len(parts))
+                _keep(parts, volume.propose(plan, report, prior=prior, done=parts))
                 write_records(self.folder.volume, mark, volume.run(plan, report, parts))
             parts.remove()
 

@@ -22,6 +22,8 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 _CELLS = (0.32, 0.56)  # m, the least and the largest voxel
 _LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
 _SHORTEST = 15  # frames of a clip
+_OFF, _OFTEN = (0.5, 1.5), (0.7, 0.3)  # m, by which a fit misses the middle of the smoke when it asks, and when it first asks
+_MIDDLE_FRAMES = 5  # that the middle is taken of
 _FOOT_FRAMES = 16  # that the source is looked for in
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
@@ -49,11 +51,12 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
     cell = draw.uniform(*_CELLS)
     reach = 0.5 * SHAPE[2] * cell
-    centre = np.array([*draw.normal(0.0, 0.9, 2), reach + draw.uniform(-0.1, 0.25) * (20.0 - 2 * reach) + draw.normal(0.0, 0.5)])
+    height = reach + draw.uniform(-0.1, 0.25) * (20.0 - 2 * reach) + draw.normal(0.0, 0.5)
+    centre = np.array([*(_middle(plume, first, num_frames) + draw.normal(0.0, draw.choice(_OFF, p=_OFTEN), 2)), height])
     size = draw.integers(_LEAST, _MOST, endpoint=True)
     views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
-    lattice = Lattice(origin=plume.origin, voxel_size=VOXEL_SIZE, shape=plume.density.shape[1:])  # type: ignore[arg-type]
+    lattice = lattice_of(plume)
     noise = draw.choice([0.002, 0.01])
 
     def clear_depth_at(index: int) -> np.ndarray:
@@ -78,6 +81,22 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
         density=density * (cell / window.scale),
         velocity=velocity * (stride / FPS / cell),
     )
+
+
+def _middle(plume: Plume, first: int, num_frames: int) -> np.ndarray:
+    """x and y m of the middle of a clip's smoke; the world's where there is none."""
+    frames = np.linspace(first, first + num_frames - 1, _MIDDLE_FRAMES).round().astype(int)
+    mass = sum(plume.density_at(frame).sum(axis=2, dtype=np.float64) for frame in frames)
+    total = np.sum(mass)
+    if not total > 0.0:
+        return np.zeros(2)
+    across = [np.sum(mass, axis=1 - axis) @ np.arange(np.shape(mass)[axis]) / total for axis in range(2)]
+    return np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(across)
+
+
+def lattice_of(plume: Plume) -> Lattice:
+    """Where its voxels lie."""
+    return Lattice(origin=plume.origin, voxel_size=VOXEL_SIZE, shape=plume.density.shape[1:])  # type: ignore[arg-type]
 
 
 def truth(plume: Plume, moment: int, stand: Stand) -> tuple[np.ndarray, np.ndarray]:

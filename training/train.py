@@ -63,6 +63,11 @@ class Lessons:
         return Sight(**part), density, velocity
 
 
+def held_back(plumes: list[Path]) -> list[Path]:
+    """Those of a library, in order, that are not learned from."""
+    return plumes[5::_HELD_BACK]
+
+
 def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor, list[float]]:
     """What is to become small, and of each net the squared error of density and of velocity inside smoke, each in units of the
     truth's own size."""
@@ -129,7 +134,7 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     folders = [sorted(folder.glob("*.npz")) for folder in given.lessons]
-    held = [path for paths in folders for path in paths[5::_HELD_BACK]]
+    held = [path for paths in folders for path in held_back(paths)]
     lessons, unseen = Lessons([path for paths in folders for path in paths if path not in held]), Lessons(held)
     torch.manual_seed(0)
     net = PlumeNet().to(memory_format=torch.channels_last_3d)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from backend.contract.job import Config
 from backend.estimate.machine import HEIGHT, NUM_PARTICLES, WIDTH
 from backend.fit.pace import longest_stride
+from backend.fit.region import ROUNDS, num_probes
 from backend.fit.survey import Survey
 
 ONE_HUE_SHARE = 0.65  # of the time that three channels take to be drawn and differentiated
@@ -61,7 +63,8 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
         "smoke": [Term(name="write", kind="pixels", amount=count * pixels)],
     }
     if asks_prior(config):
-        asked = -(-count // min(config.volume.every, longest_stride(count)))
+        asked = math.ceil(count / min(config.volume.every, longest_stride(count)))
+        asked += ROUNDS * num_probes(asked)
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),
             Term(name="propose", kind="network", amount=asked / max(1, min(threads, 8))),

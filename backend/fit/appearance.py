@@ -30,7 +30,7 @@ BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fil
 RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in a frame
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
-CALM_DEPTH = 0.3  # share of what stands out of the prior's solid in depth
+CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
 
 
@@ -80,9 +80,12 @@ class Appearance:
         guide = self.depths.guide(frame)
         if guide is not None:
             record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses))
-        record = self._calmed(record, layer, view, self.depths.prior(frame))
+        record = self._calmed(record, layer, view)
         if guide is not None:
             record = replace(record, optical_masses=drawn_level(guide, record.positions, record.optical_masses))
+        else:
+            prior = self.depths.prior(frame)
+            record = replace(record, positions=depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH))
         record = self._weighed(record, frame, target, consistency=config.consistency)
         record = self.with_births(record, frame, target)
         record = self._weighed(record, frame, target, consistency=0.0)
@@ -90,9 +93,8 @@ class Appearance:
             return record, 0.0
         return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale, hue=self.hue)
 
-    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, prior: depth_prior.DepthPrior) -> VisualRecord:
-        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows,
-        depth into the prior's solid.
+    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View) -> VisualRecord:
+        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows.
 
         Behind the surface of thick smoke nothing holds single particles, and noise would gather in them from frame to
         frame. The fit that follows restores what the view does tell.
@@ -109,8 +111,7 @@ class Appearance:
         usual = layer[..., :3].sum(axis=(0, 1)) / max(float(layer[..., 3].sum()), 1e-6)
         shown = np.where(opacity > 0.05, seen / np.maximum(opacity, 0.02), usual)
         colors = (1.0 - CALM_COLOR) * record.colors + CALM_COLOR * shown
-        positions = depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH)
-        return replace(record, positions=positions, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
+        return replace(record, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
 
     def _weighed(self, record: VisualRecord, frame: int, target: np.ndarray, *, consistency: float) -> VisualRecord:
         """Masses after the frame was seen, without the spent and the departed."""

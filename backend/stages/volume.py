@@ -1,12 +1,13 @@
 """Where in depth the smoke is and how it moves: for each frame what the prior proposes, on a grid before its camera.
 
-First the prior is asked about some frames (`propose`), which takes most of the time; then what it said is carried to those
-between, and brought to agree with what lasts around a frame and with what the frame shows (`run`).
+First the grids are brought to where the smoke is, by what the prior says of a few frames (`centred`); then it is asked about
+more frames (`propose`), which takes most of the time; then what it said is carried to those between, and brought to agree with
+what lasts around a frame and with what the frame shows (`run`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -18,7 +19,7 @@ from backend.fit.between import between
 from backend.fit.guide import Guide
 from backend.fit.lasting import Lasting
 from backend.fit.pace import stride_of
-from backend.fit.region import Region, find_region
+from backend.fit.region import ROUNDS, Region, find_region, num_probes
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
@@ -30,6 +31,7 @@ from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 _LONGER = 8  # a proposal takes as long as so many records
+_NEAR_ENOUGH = 0.5  # voxels that the middle moves at most in a last round
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +48,12 @@ class Plan:
     @property
     def work(self) -> int:
         """Steps of its progress."""
-        return _LONGER * len(self.asked) + len(self.region.depths)
+        return _LONGER * (self.probes + len(self.asked)) + len(self.region.depths)
+
+    @property
+    def probes(self) -> int:
+        """Frames that the prior is asked about at most before the grids stand where they stay."""
+        return ROUNDS * num_probes(len(self.asked))
 
     def proposed(self, prior: Prior, frame: int) -> Proposal:
         """The prior's own word on a frame."""
@@ -101,6 +108,31 @@ def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, 
     return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked)
 
 
+def centred(plan: Plan, report: Report, *, prior: Prior, num_done: int = 0, num_workers: int = 0) -> Plan:
+    """The plan with its grids around the middle of the smoke, as the prior sees it in a few frames.
+
+    From the pictures alone smoke that drifts sideways is not told from smoke further away or nearer: grids that stand by that
+    can miss much of it. What the prior says of a grid that holds part of it points to the rest. num_done: asked frames that were
+    answered before; num_workers: as for `propose`.
+    """
+    last, count = len(plan.region.depths) - 1, num_probes(len(plan.asked))
+    frames = [round(last * (index + 1) / (count + 1)) for index in range(count)]
+    for number in range(ROUNDS):
+        moment, mass = np.zeros(3), 0.0
+        region, done = plan.region, _LONGER * (num_done + count * number)
+        for frame, answer in zip(frames, _answers(plan, report, frames, prior, num_workers, done=done), strict=True):
+            density = agreed(answer.density, answer.stand, region.depths[frame], region.views[frame]).astype(np.float64)
+            moment += density.ravel() @ answer.stand.centres().reshape(-1, 3)
+            mass += float(density.sum())
+        if not mass > 0.0:
+            break
+        centre = np.array([*(moment[:2] / mass), region.centre[2]])
+        plan = replace(plan, region=replace(region, centre=centre))
+        if np.linalg.norm(centre - region.centre) <= _NEAR_ENOUGH * region.voxel_size:
+            break
+    return plan
+
+
 def propose(
     plan: Plan,
     report: Report,
@@ -110,15 +142,9 @@ def propose(
     num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
     """Yields what the prior says of the asked frames behind those that are `done`, in the upright world."""
-    at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
     num_done = len(done)
-    left = plan.asked[num_done:]
-    with ThreadPoolExecutor(at_once) as pool:
-        for first in range(0, len(left), at_once):
-            report.progress(_LONGER * (num_done + first), plan.work)
-            with one_thread():
-                answers = list(pool.map(lambda frame: plan.proposed(prior, frame), left[first : first + at_once]))
-            yield from (_packed(answer, answer.stand.from_world) for answer in answers)
+    answers = _answers(plan, report, plan.asked[num_done:], prior, num_workers, done=_LONGER * (plan.probes + num_done))
+    yield from (_packed(answer, answer.stand.from_world) for answer in answers)
 
 
 def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator[VolumeRecord]:
@@ -129,10 +155,23 @@ def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator
     for index, last in enumerate(plan.asked[1:]):
         before, after = after, _unpacked(proposals[index + 1])
         for frame in range(plan.asked[index] + 1, last + 1):
-            report.progress(_LONGER * len(plan.asked) + frame, plan.work)
+            report.progress(plan.work - len(plan.region.depths) + frame, plan.work)
             proposal = plan.amid(before, after, index, frame)
             yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
     report.progress(plan.work, plan.work)
+
+
+def _answers(
+    plan: Plan, report: Report, frames: Sequence[int], prior: Prior, num_workers: int, *, done: int
+) -> Iterator[Proposal]:
+    """The prior's own words on some frames, in order. done: steps of the stage's progress before them."""
+    at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(frames), at_once):
+            report.progress(done + _LONGER * first, plan.work)
+            with one_thread():
+                answers = list(pool.map(lambda frame: plan.proposed(prior, frame), frames[first : first + at_once]))
+            yield from answers
 
 
 def _packed(proposal: Proposal, from_world: np.ndarray) -> VolumeRecord:

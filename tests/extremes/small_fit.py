@@ -111,9 +111,10 @@ def fit(
     report = SilentReport()
     volumes: list[VolumeRecord] | None = None
     if prior is not None:
-        plan = volume.make_plan(layers, cameras)
-        proposals = [] if plan is None else list(volume.propose(plan, report, prior=prior, done=[], num_workers=1))
-        volumes = [] if plan is None else list(volume.run(plan, report, proposals))
+        plan, volumes = volume.make_plan(layers, cameras), []
+        if plan is not None:
+            plan = volume.centred(plan, report, prior=prior, num_workers=1)
+            volumes = list(volume.run(plan, report, list(volume.propose(plan, report, prior=prior, done=[], num_workers=1))))
     shared = {"method": method, "published": PUBLISHED, "volumes": volumes}
     fluid = list(physical.run(layers, cameras, PHYSICAL, report, seed=0, done=[], **shared))
     seen = list(visual.run(layers, cameras, fluid, VISUAL, report, seed=0, done=[], **shared))

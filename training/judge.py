@@ -1,0 +1,153 @@
+"""How right the volumes of a fit are for plumes that the prior was held back from.
+
+    .venv/backend/bin/python -m training.judge --plumes DIR --json FILE [--weights FILE]
+
+A scene of the benchmark is one plume, and what is chosen by three of them may be chosen by chance; here are as many as were held
+back, in any wind. Each is filmed as the benchmark's are, and its volumes are made as a fit makes them
+(`backend/stages/volume.py`), on the grids that the pictures alone ask for and on those that the prior then moves to where it sees
+the smoke. Every plume is written as soon as it is judged; those that the file holds are not judged again.
+"""
+
+from __future__ import annotations
+
+from backend import kernel_setup  # noqa: F401 before numba loads
+
+# isort: split
+import argparse
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from backend.field.rays import optical_depth
+from backend.fit.guide import Guide
+from backend.fit.state import VolumeRecord
+from backend.geometry.camera import View, view_at
+from backend.io.atomic import write_text
+from backend.prior.predict import Prior
+from backend.prior.weights import WEIGHTS, weights_fingerprint
+from backend.reporting import SilentReport
+from backend.score.measures import LARGEST_DB, correlation
+from backend.stages import volume
+from synthetic.progress import Progress
+from synthetic.sweep import Orbit, orbit_cameras, still_cameras
+from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume, read_plume
+from training.samples import lattice_of, truth
+from training.train import held_back
+
+_SIZE = 90, 160  # px
+_SEEN = 120  # frames of a clip
+_VIEWS = {"nvs_last_db": 0.0, "side_db": 90.0}  # degrees from the first place of the camera
+_FAINT = 20.0  # 1/m, summed over the voxels: a moment with less shows no smoke
+_LEVEL = 0.02  # of the fullest level: those with less are not asked where they are
+
+
+def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Any]:
+    """Smoke layers [H, W, 4] of the frames that are seen, in eight bits with noise, and the cameras."""
+    width, height = _SIZE
+    cameras = orbit_cameras(Orbit(), width=width, height=height, fps=FPS, num_frames=NUM_FRAMES)
+    layers = []
+    for frame in range(_SEEN):
+        opacity = opacity_of(plume, frame, view_at(cameras, frame))
+        opacity = np.clip(np.round(255 * opacity + draw.normal(0, 0.5, opacity.shape)), 0, 254) / 255
+        layers.append(np.dstack([0.4 * opacity] * 3 + [opacity]).astype(np.float32))
+    return layers, replace(cameras, camera_to_world=cameras.camera_to_world[:_SEEN])
+
+
+def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:
+    """[H, W] of the true smoke."""
+    return -np.expm1(-optical_depth(plume.density_at(frame), lattice_of(plume), view, step=0.5))
+
+
+def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
+    """Means over moments: PSNR of the opacity from the first place in the last third of the clip and from aside, dB;
+    correlations of density, and of velocity inside smoke along the grid's axes; and how far the middle of a level lies from
+    the true one in depth, m, root of the mean square over the smoke."""
+    width, height = _SIZE
+    views = {
+        name: view_at(still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS), 0)
+        for name, degrees in _VIEWS.items()
+    }
+    moments = [t for t in range(0, _SEEN, 2 * VELOCITY_EVERY) if plume.density_at(t).sum(dtype=np.float64) > _FAINT]
+    rows: dict[str, list[float]] = {}
+
+    def tell(name: str, value: float) -> None:
+        rows.setdefault(name, []).append(value)
+
+    for frame in moments:
+        guide = Guide(records[frame])
+        stand, density = guide.stand, guide.density
+        for name, view in views.items():
+            if name.startswith("nvs") and frame < 2 * _SEEN // 3:
+                continue
+            shown = -np.expm1(-optical_depth(density, stand.lattice, stand.seen(view)))
+            error = float(np.square(shown - opacity_of(plume, frame, view)).mean(dtype=np.float64))
+            tell(name, min(LARGEST_DB, -10.0 * math.log10(max(error, 1e-12))))
+        real, speed = truth(plume, frame, stand)
+        tell("density", correlation(density, real))
+        inside = real > 0.01 * real.max(initial=0.0)
+        ours = guide.velocity @ stand.from_world[:3, :3].T
+        for axis, name in enumerate(("sideways", "depth", "up")):
+            tell(name, correlation(ours[..., axis][inside], speed[..., axis][inside]))
+        tell("level_m", stand.lattice.voxel_size * levels_off(density, real))
+    return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items()}
+
+
+def levels_off(ours: np.ndarray, real: np.ndarray) -> float:
+    """Voxels between the middles in depth of the levels of two densities [X, Y, Z], root of the mean square over the smoke."""
+    masses = [density.sum(axis=(0, 1), dtype=np.float64) for density in (ours, real)]
+    counted = (masses[0] > _LEVEL * masses[0].max()) & (masses[1] > _LEVEL * masses[1].max())
+    if not counted.any():
+        return math.nan
+    at = np.arange(ours.shape[1], dtype=np.float64)
+    middles = [
+        np.einsum("xyz,y->z", density[..., counted], at) / mass[counted]
+        for density, mass in zip((ours, real), masses, strict=True)
+    ]
+    return math.sqrt(np.average(np.square(middles[0] - middles[1]), weights=masses[1][counted]))
+
+
+def judged(plume: Plume, prior: Prior, *, seed: int) -> dict[str, dict[str, float]]:
+    """By grid: as the pictures alone ask for it, and as the prior moves it."""
+    report = SilentReport()
+    layers, cameras = film(plume, np.random.default_rng(seed))
+    plan = volume.make_plan(layers, cameras, every=5)
+    if plan is None:
+        return {}
+    found = {}
+    for name, way in (("by the pictures", plan), ("by the prior", volume.centred(plan, report, prior=prior))):
+        proposals = list(volume.propose(way, report, prior=prior, done=[]))
+        found[name] = judge(plume, list(volume.run(way, report, proposals)))
+    return found
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plumes", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    given = parser.parse_args(arguments)
+    folders = held_back(sorted(path.parent for path in given.plumes.glob("*/plume.json")))
+    mark = weights_fingerprint(given.weights)[:12]
+    results: dict[str, Any] = {"weights": mark, "plumes": {}}
+    if given.json.exists():
+        results = json.loads(given.json.read_text(encoding="utf-8"))
+        if results["weights"] != mark:
+            parser.error(f"{given.json} is of other weights; name another file.")
+    prior, progress = Prior(given.weights), Progress(label="judge volumes", total=len(folders))
+    for folder in folders:
+        plume = read_plume(folder)
+        if plume.scene.name not in results["plumes"]:
+            wind = round(float(np.hypot(*plume.scene.wind)), 3)
+            results["plumes"][plume.scene.name] = {"wind": wind, **judged(plume, prior, seed=plume.scene.seed)}
+            write_text(given.json, json.dumps(results, indent=1) + "\n")
+        progress.step()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
