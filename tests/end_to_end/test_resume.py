@@ -30,7 +30,7 @@ def test_twenty_kills_leave_the_same_bytes(plume: Path, tmp_path: Path) -> None:
             backend_command(*command, "--job", killed), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment()
         )
         try:
-            process.wait(timeout=moments.uniform(0.3, 1.0) * seconds)
+            process.wait(timeout=moments.uniform(0.2, 0.7) * seconds)  # what goes on has less to do
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             process.wait()
@@ -41,7 +41,7 @@ def test_twenty_kills_leave_the_same_bytes(plume: Path, tmp_path: Path) -> None:
             for path in killed.rglob("*"):  # begin again, so that later kills meet unfinished work too
                 if path.is_file() and path.name in ("result.json", "visual.h5", "particles.h5"):
                     path.unlink()
-    assert killed_at_work >= NUM_KILLS // 2
+    assert killed_at_work >= NUM_KILLS // 2, f"{killed_at_work} of {NUM_KILLS} met a job at work"
     assert checked > 0
     assert backend(*command, "--job", killed).returncode == 0
     leftovers = [path for path in killed.rglob("*.part*")]
