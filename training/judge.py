@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from backend.contract.cameras import Cameras
 from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
@@ -31,7 +32,7 @@ from backend.io.atomic import write_text
 from backend.prior.predict import Prior
 from backend.prior.weights import WEIGHTS, weights_fingerprint
 from backend.reporting import SilentReport
-from backend.score.measures import LARGEST_DB, correlation
+from backend.score.measures import correlation, decibels
 from backend.stages import volume
 from synthetic.progress import Progress
 from synthetic.sweep import Orbit, orbit_cameras, still_cameras
@@ -46,7 +47,7 @@ _FAINT = 20.0  # 1/m, summed over the voxels: a moment with less shows no smoke
 _LEVEL = 0.02  # of the fullest level: those with less are not asked where they are
 
 
-def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Any]:
+def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Cameras]:
     """Smoke layers [H, W, 4] of the frames that are seen, in eight bits with noise, and the cameras."""
     width, height = _SIZE
     cameras = orbit_cameras(Orbit(), width=width, height=height, fps=FPS, num_frames=NUM_FRAMES)
@@ -85,8 +86,7 @@ def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
             if name.startswith("nvs") and frame < 2 * _SEEN // 3:
                 continue
             shown = -np.expm1(-optical_depth(density, stand.lattice, stand.seen(view)))
-            error = float(np.square(shown - opacity_of(plume, frame, view)).mean(dtype=np.float64))
-            tell(name, min(LARGEST_DB, -10.0 * math.log10(max(error, 1e-12))))
+            tell(name, decibels(float(np.square(shown - opacity_of(plume, frame, view)).mean(dtype=np.float64))))
         real, speed = truth(plume, frame, stand)
         tell("density", correlation(density, real))
         inside = real > 0.01 * real.max(initial=0.0)

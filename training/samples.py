@@ -86,12 +86,10 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
 def _middle(plume: Plume, first: int, num_frames: int) -> np.ndarray:
     """x and y m of the middle of a clip's smoke; the world's where there is none."""
     frames = np.linspace(first, first + num_frames - 1, _MIDDLE_FRAMES).round().astype(int)
-    mass = sum(plume.density_at(frame).sum(axis=2, dtype=np.float64) for frame in frames)
-    total = np.sum(mass)
-    if not total > 0.0:
+    mass = np.sum([plume.density_at(frame).sum(axis=2, dtype=np.float64) for frame in frames], axis=0)
+    if not mass.any():
         return np.zeros(2)
-    across = [np.sum(mass, axis=1 - axis) @ np.arange(np.shape(mass)[axis]) / total for axis in range(2)]
-    return np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(across)
+    return np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass))
 
 
 def lattice_of(plume: Plume) -> Lattice:

@@ -56,6 +56,17 @@ def test_pictures_have_many_sizes_and_nothing_beyond_them(recorded: Plume) -> No
     assert len(sizes) > 3
 
 
+def test_grids_stand_around_the_smoke(recorded: Plume) -> None:
+    """As a fit's do once the prior has moved them, give or take what it misses by."""
+    found = []
+    for number in range(24):
+        mass = draw_lesson(recorded, np.random.default_rng(number)).density.sum(axis=2)
+        found.append(np.array([mass.sum(axis=1) @ np.arange(SHAPE[0]), mass.sum(axis=0) @ np.arange(SHAPE[1])]) / mass.sum())
+    off = np.abs(np.array(found) - 11.5)
+    assert np.median(off) < 2.0
+    assert off.max() > 2.0
+
+
 def test_clips_are_short_and_long(recorded: Plume) -> None:
     """Of a short clip a window sees less than it could, and compares pictures that are closer in time."""
     spans = [float(np.ptp(draw_lesson(recorded, np.random.default_rng(number)).window.strides)) for number in range(20)]
