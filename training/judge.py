@@ -1,11 +1,12 @@
-"""How right the volumes of a fit are for plumes that the prior was held back from.
+"""How right the volumes of a fit, and its particles, are for plumes that the prior was held back from.
 
     .venv/backend/bin/python -m training.judge --plumes DIR --json FILE [--weights FILE]
 
 A scene of the benchmark is one plume, and what is chosen by three of them may be chosen by chance; here are as many as were held
 back, in any wind. Each is filmed as the benchmark's are, and its volumes are made as a fit makes them
 (`backend/stages/volume.py`), on the grids that the pictures alone ask for and on those that the prior then moves to where it sees
-the smoke. Every plume is written as soon as it is judged; those that the file holds are not judged again.
+the smoke. The particles that a fit makes of the latter are judged, too: what is better of volumes is not always better of them.
+Every plume is written as soon as it is judged; those that the file holds are not judged again.
 """
 
 from __future__ import annotations
@@ -24,16 +25,20 @@ from typing import Any
 import numpy as np
 
 from backend.contract.cameras import Cameras
+from backend.contract.job import preset_config
 from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
-from backend.fit.state import VolumeRecord
+from backend.fit.state import VisualRecord, VolumeRecord, particle_frame
 from backend.geometry.camera import View, view_at
 from backend.io.atomic import write_text
 from backend.prior.predict import Prior
 from backend.prior.weights import WEIGHTS, weights_fingerprint
+from backend.render.picture import picture
+from backend.render.voxelize import voxelize
 from backend.reporting import SilentReport
-from backend.score.measures import correlation, decibels
-from backend.stages import volume
+from backend.score.measures import coded, correlation, decibels, velocity_scores
+from backend.score.volumes import camera_axes
+from backend.stages import visual, volume
 from synthetic.progress import Progress
 from synthetic.sweep import Orbit, orbit_cameras, still_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume, read_plume
@@ -41,7 +46,9 @@ from training.samples import lattice_of, truth
 from training.train import held_back
 
 _SIZE = 90, 160  # px
+_LIGHT = 0.4  # of opaque smoke, linear
 _SEEN = 120  # frames of a clip
+_PRESET = "draft"  # of the particles: the volumes that lead them are every preset's
 _VIEWS = {"nvs_last_db": 0.0, "side_db": 90.0}  # degrees from the first place of the camera
 _FAINT = 20.0  # 1/m, summed over the voxels: a moment with less shows no smoke
 _LEVEL = 0.02  # of the fullest level: those with less are not asked where they are
@@ -55,8 +62,13 @@ def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Cam
     for frame in range(_SEEN):
         opacity = opacity_of(plume, frame, view_at(cameras, frame))
         opacity = np.clip(np.round(255 * opacity + draw.normal(0, 0.5, opacity.shape)), 0, 254) / 255
-        layers.append(np.dstack([0.4 * opacity] * 3 + [opacity]).astype(np.float32))
+        layers.append(layer_of(opacity))
     return layers, replace(cameras, camera_to_world=cameras.camera_to_world[:_SEEN])
+
+
+def layer_of(opacity: np.ndarray) -> np.ndarray:
+    """[H, W] -> [H, W, 4] float32 premultiplied linear light: evenly lit smoke."""
+    return np.dstack([_LIGHT * opacity] * 3 + [opacity]).astype(np.float32)
 
 
 def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:
@@ -65,28 +77,21 @@ def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:
 
 
 def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
-    """Means over moments: PSNR of the opacity from the first place in the last third of the clip and from aside, dB;
+    """Means over moments: PSNR of the picture as the benchmark scores it (thin smoke counts: sRGB), from the first place in the
+    last third of the clip and from aside, dB;
     correlations of density, and of velocity inside smoke along the grid's axes; and how far the middle of a level lies from
     the true one in depth, m, root of the mean square over the smoke."""
-    width, height = _SIZE
-    views = {
-        name: view_at(still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS), 0)
-        for name, degrees in _VIEWS.items()
-    }
-    moments = [t for t in range(0, _SEEN, 2 * VELOCITY_EVERY) if plume.density_at(t).sum(dtype=np.float64) > _FAINT]
     rows: dict[str, list[float]] = {}
 
     def tell(name: str, value: float) -> None:
         rows.setdefault(name, []).append(value)
 
-    for frame in moments:
+    for frame in _moments(plume):
         guide = Guide(records[frame])
         stand, density = guide.stand, guide.density
-        for name, view in views.items():
-            if name.startswith("nvs") and frame < 2 * _SEEN // 3:
-                continue
+        for name, view in _views(frame).items():
             shown = -np.expm1(-optical_depth(density, stand.lattice, stand.seen(view)))
-            tell(name, decibels(float(np.square(shown - opacity_of(plume, frame, view)).mean(dtype=np.float64))))
+            tell(name, _likeness(layer_of(shown), plume, frame, view))
         real, speed = truth(plume, frame, stand)
         tell("density", correlation(density, real))
         inside = real > 0.01 * real.max(initial=0.0)
@@ -95,6 +100,43 @@ def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
             tell(name, correlation(ours[..., axis][inside], speed[..., axis][inside]))
         tell("level_m", stand.lattice.voxel_size * levels_off(density, real))
     return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items()}
+
+
+def judge_particles(plume: Plume, cameras: Cameras, records: list[VisualRecord]) -> dict[str, float]:
+    """As `judge`, of the Gaussians of all frames, on the plume's own voxels; where levels lie is not asked."""
+    rows: dict[str, list[float]] = {}
+    for frame in _moments(plume):
+        ours = particle_frame(records[frame])
+        for name, view in _views(frame).items():
+            rows.setdefault(name, []).append(_likeness(picture(ours, view), plume, frame, view))
+        grids, real = voxelize(ours, lattice_of(plume)), plume.density_at(frame)
+        rows.setdefault("density", []).append(correlation(grids["density"], real))
+        axes = camera_axes(view_at(cameras, frame))
+        moves = velocity_scores(grids["velocity"], plume.velocity_at(frame), real, axes)
+        for name in ("sideways", "depth", "up"):
+            rows.setdefault(name, []).append(moves[f"correlation_{name}"])
+    return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items()}
+
+
+def _moments(plume: Plume) -> list[int]:
+    """The frames that are judged: those with velocities, and with smoke."""
+    return [t for t in range(0, _SEEN, 2 * VELOCITY_EVERY) if plume.density_at(t).sum(dtype=np.float64) > _FAINT]
+
+
+def _views(frame: int) -> dict[str, View]:
+    """From where a frame is looked at; from the first place late in the clip alone, when the camera has gone far."""
+    width, height = _SIZE
+    return {
+        name: view_at(still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS), 0)
+        for name, degrees in _VIEWS.items()
+        if degrees or frame >= 2 * _SEEN // 3
+    }
+
+
+def _likeness(shown: np.ndarray, plume: Plume, frame: int, view: View) -> float:
+    """PSNR of a picture [H, W, 4], dB."""
+    wrong = coded(shown) - coded(layer_of(opacity_of(plume, frame, view)))
+    return decibels(float(np.square(wrong).mean(dtype=np.float64)))
 
 
 def levels_off(ours: np.ndarray, real: np.ndarray) -> float:
@@ -118,11 +160,14 @@ def judged(plume: Plume, prior: Prior, *, seed: int) -> dict[str, dict[str, floa
     plan = volume.make_plan(layers, cameras, every=5)
     if plan is None:
         return {}
-    found = {}
+    found, records = {}, []
     for name, way in (("by the pictures", plan), ("by the prior", volume.centred(plan, report, prior=prior))):
         proposals = list(volume.propose(way, report, prior=prior, done=[]))
-        found[name] = judge(plume, list(volume.run(way, report, proposals)))
-    return found
+        records = list(volume.run(way, report, proposals))
+        found[name] = judge(plume, records)
+    config = preset_config(_PRESET).visual
+    particles = list(visual.run(layers, cameras, [], config, report, seed=0, done=[], volumes=records))
+    return found | {"particles": judge_particles(plume, cameras, particles)}
 
 
 def main(arguments: list[str]) -> int:

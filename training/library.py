@@ -1,7 +1,7 @@
 """The plumes on disk: each simulated once, as small arrays that a training can map into memory.
 
-DIR/0001/density.npy   [F, X, Y, Z] uint8: 255 sqrt(density / MOST_DENSITY), every frame, 0.25 m
-DIR/0001/velocity.npy  [F // VELOCITY_EVERY + 1, X/2, Y/2, Z/2, 3] float16 m/s, every VELOCITY_EVERY frames, 0.5 m
+DIR/0001/density.npy   [F, X, Y, Z] uint8: 255 sqrt(density / MOST_DENSITY), every frame
+DIR/0001/velocity.npy  [F / VELOCITY_EVERY, X, Y, Z, 3] float16 m/s, every VELOCITY_EVERY frames
 DIR/0001/plume.json    where the voxels lie; written last
 
 .venv/backend/bin/python -m training.library --out DIR --seeds 0:150

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from backend.field.rays import optical_depth
 from backend.fit.pace import longest_stride
-from backend.fit.region import PIXELS_A_CELL
+from backend.fit.region import CELLS_HIGH, CELLS_WIDE, PIXELS_A_CELL
 from backend.fit.scene import meeting_point
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -19,11 +19,18 @@ from backend.prior.window import Stand, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 
-_CELLS = (0.32, 0.56)  # m, the least and the largest voxel
+_WHOLE = 0.65  # of the lessons: their pictures show all of the smoke, and the grid holds it
 _LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
-_SHORTEST = 15  # frames of a clip
-_OFF, _OFTEN = (0.5, 1.5), (0.7, 0.3)  # m, by which a fit misses the middle of the smoke when it asks, and when it first asks
-_MIDDLE_FRAMES = 5  # that the middle is taken of
+_LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
+_STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
+_STEP_SPREAD = 0.25  # of its logarithm
+_SHORTEST = 15, 90  # frames of a clip, of one lesson in two
+_OFF, _OFTEN = (
+    (0.7, 2.0),
+    (0.5, 0.5),
+)  # m, by which the grid stands beside the smoke: who is taught that it stands right, holds back
+_FRAMES = 5  # that tell where a clip's smoke is and how fast
+_EDGE = 0.03  # of the largest optical depth: where smoke ends
 _FOOT_FRAMES = 16  # that the source is looked for in
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
@@ -43,17 +50,20 @@ class Lesson:
 
 def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     """A random moment, camera and noise."""
-    num_frames = int(draw.integers(_SHORTEST, NUM_FRAMES + 1))
-    stride = min(int(draw.integers(2, 7)), longest_stride(num_frames))
+    num_frames = int(draw.integers(draw.choice(_SHORTEST), NUM_FRAMES + 1))
     first = int(draw.integers(0, NUM_FRAMES - num_frames + 1))
     candidates = [t for t in range(first, first + num_frames) if t % VELOCITY_EVERY == 0]
     moment = int(draw.choice(candidates))
     kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
-    cell = draw.uniform(*_CELLS)
-    reach = 0.5 * SHAPE[2] * cell
-    height = reach + draw.uniform(-0.1, 0.25) * (20.0 - 2 * reach) + draw.normal(0.0, 0.5)
-    centre = np.array([*(_middle(plume, first, num_frames) + draw.normal(0.0, draw.choice(_OFF, p=_OFTEN), 2)), height])
-    size = draw.integers(_LEAST, _MOST, endpoint=True)
+    smoke = _smoke_of(plume, first, num_frames)
+    is_whole = draw.random() < _WHOLE
+    cell = smoke.cell * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+    cut = max(smoke.top - smoke.bottom - CELLS_HIGH * cell, 0.0)  # what does not fit into the grid, mostly above
+    height = 0.5 * (smoke.bottom + smoke.top) - draw.uniform(0.0, 0.6) * cut + draw.normal(0.0, cell)
+    centre = np.array([*(smoke.middle + draw.normal(0.0, draw.choice(_OFF, p=_OFTEN), 2)), height])
+    size = draw.integers(_LEAST_WHOLE if is_whole else _LEAST, _MOST, endpoint=True)
+    step = _STEP * cell * draw.lognormal(0.0, _STEP_SPREAD)
+    stride = int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
     views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = lattice_of(plume)
@@ -83,13 +93,47 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     )
 
 
-def _middle(plume: Plume, first: int, num_frames: int) -> np.ndarray:
-    """x and y m of the middle of a clip's smoke; the world's where there is none."""
-    frames = np.linspace(first, first + num_frames - 1, _MIDDLE_FRAMES).round().astype(int)
-    mass = np.sum([plume.density_at(frame).sum(axis=2, dtype=np.float64) for frame in frames], axis=0)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Smoke:
+    """Of a clip. middle [2] m: x and y; bottom, top: m; cell: m, the voxel of a grid that it fills; speed: m/s across a view."""
+
+    middle: np.ndarray
+    bottom: float
+    top: float
+    cell: float
+    speed: float
+
+
+def _smoke_of(plume: Plume, first: int, num_frames: int) -> _Smoke:
+    """Where a clip's smoke is and how fast; the whole world's where there is none."""
+    frames = np.linspace(first, first + num_frames - 1, _FRAMES).round().astype(int) // VELOCITY_EVERY * VELOCITY_EVERY
+    mass, levels, widths, speeds, weights = np.zeros(plume.density.shape[1:3]), [], [], [], []
+    for frame in frames:
+        density = plume.density_at(frame)
+        mass += density.sum(axis=2, dtype=np.float64)
+        for axis in (0, 1):
+            depth = density.sum(axis=axis)
+            is_smoke = depth > _EDGE * max(float(depth.max()), 1e-3)
+            levels.append(np.flatnonzero(is_smoke.any(axis=0)))
+            widths.append(int(is_smoke.any(axis=1).sum()))
+        x, y, z = np.moveaxis(plume.velocity_at(frame), -1, 0)
+        speeds.append(np.sqrt(0.5 * (x * x + y * y) + z * z)[density > 0])
+        weights.append(density[density > 0])
     if not mass.any():
-        return np.zeros(2)
-    return np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass))
+        top = VOXEL_SIZE * plume.density.shape[3]
+        return _Smoke(middle=np.zeros(2), bottom=0.0, top=top, cell=top / CELLS_HIGH, speed=0.0)
+    level, speed, weight = (np.concatenate(parts) for parts in (levels, speeds, weights))
+    order = np.argsort(speed)
+    reached = np.cumsum(weight[order], dtype=np.float64)
+    bottom, top = plume.origin[2] + VOXEL_SIZE * (level.min() - 0.5), plume.origin[2] + VOXEL_SIZE * (level.max() + 0.5)
+    wide = VOXEL_SIZE * float(np.quantile(widths, 0.9))
+    return _Smoke(
+        middle=np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass)),
+        bottom=float(bottom),
+        top=float(top),
+        cell=float(max((top - bottom) / CELLS_HIGH, wide / CELLS_WIDE)),
+        speed=float(speed[order[np.searchsorted(reached, 0.5 * reached[-1])]]),
+    )
 
 
 def lattice_of(plume: Plume) -> Lattice:

@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     x, y, z = np.meshgrid(*(np.arange(size) for size in SHAPE_OF_PLUME), indexing="ij")
     column = 120 * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / 12)
     density = np.stack([column * (z < 15 + 0.3 * frame) for frame in range(NUM_FRAMES)]).astype(np.uint8)
-    shape = (NUM_FRAMES // VELOCITY_EVERY + 1, *(size // 2 for size in SHAPE_OF_PLUME), 3)
+    shape = (NUM_FRAMES // VELOCITY_EVERY, *SHAPE_OF_PLUME, 3)
     np.save(path / "density.npy", density)
     np.save(path / "velocity.npy", np.broadcast_to(np.array([0.2, 0.0, 1.5], np.float16), shape))
     (path / "plume.json").write_text('{"seed": 3, "origin": [-5.83, -5.83, 0.17]}', encoding="utf-8")
