@@ -25,10 +25,9 @@ _LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
 _STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
 _STEP_SPREAD = 0.25  # of its logarithm
 _SHORTEST = 15, 90  # frames of a clip, of one lesson in two
-_OFF, _OFTEN = (
-    (0.7, 2.0),
-    (0.5, 0.5),
-)  # m, by which the grid stands beside the smoke: who is taught that it stands right, holds back
+_OFF, _OFTEN = (1.5, 4.5), (0.5, 0.5)  # voxels, by which grids stand beside the smoke: taught that they stand right, the prior
+# would leave those where they are that do not
+_LEAST_CELL = 0.2  # m; the plumes know nothing finer
 _FRAMES = 5  # that tell where a clip's smoke is and how fast
 _EDGE = 0.03  # of the largest optical depth: where smoke ends
 _FOOT_FRAMES = 16  # that the source is looked for in
@@ -57,10 +56,10 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
     smoke = _smoke_of(plume, first, num_frames)
     is_whole = draw.random() < _WHOLE
-    cell = smoke.cell * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+    cell = max(smoke.cell, _LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
     cut = max(smoke.top - smoke.bottom - CELLS_HIGH * cell, 0.0)  # what does not fit into the grid, mostly above
     height = 0.5 * (smoke.bottom + smoke.top) - draw.uniform(0.0, 0.6) * cut + draw.normal(0.0, cell)
-    centre = np.array([*(smoke.middle + draw.normal(0.0, draw.choice(_OFF, p=_OFTEN), 2)), height])
+    centre = np.array([*(smoke.middle + draw.normal(0.0, cell * draw.choice(_OFF, p=_OFTEN), 2)), height])
     size = draw.integers(_LEAST_WHOLE if is_whole else _LEAST, _MOST, endpoint=True)
     step = _STEP * cell * draw.lognormal(0.0, _STEP_SPREAD)
     stride = int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
