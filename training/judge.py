@@ -77,45 +77,49 @@ def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:
 
 
 def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
-    """Means over moments: PSNR of the picture as the benchmark scores it (thin smoke counts: sRGB), from the first place in the
-    last third of the clip and from aside, dB;
-    correlations of density, and of velocity inside smoke along the grid's axes; and how far the middle of a level lies from
-    the true one in depth, m, root of the mean square over the smoke."""
-    rows: dict[str, list[float]] = {}
-
-    def tell(name: str, value: float) -> None:
-        rows.setdefault(name, []).append(value)
-
+    """Means over moments, on the grids' voxels: PSNR of the picture as the benchmark scores it (sRGB: thin smoke counts), from
+    the first place in the last third of the clip and from aside, dB; correlations of density, and of velocity inside smoke; and
+    how far the middle of a level lies from the true one in depth, m, root of the mean square over the smoke."""
+    rows = []
     for frame in _moments(plume):
         guide = Guide(records[frame])
-        stand, density = guide.stand, guide.density
+        stand, own = guide.stand, guide.stand.from_world[:3, :3]
+        density, velocity = truth(plume, frame, stand)
+        row = _row((guide.density, guide.velocity @ own.T), (density, velocity), axes=np.eye(3)[[0, 2, 1]])
+        row["level_m"] = stand.lattice.voxel_size * levels_off(guide.density, density)
         for name, view in _views(frame).items():
-            shown = -np.expm1(-optical_depth(density, stand.lattice, stand.seen(view)))
-            tell(name, _likeness(layer_of(shown), plume, frame, view))
-        real, speed = truth(plume, frame, stand)
-        tell("density", correlation(density, real))
-        inside = real > 0.01 * real.max(initial=0.0)
-        ours = guide.velocity @ stand.from_world[:3, :3].T
-        for axis, name in enumerate(("sideways", "depth", "up")):
-            tell(name, correlation(ours[..., axis][inside], speed[..., axis][inside]))
-        tell("level_m", stand.lattice.voxel_size * levels_off(density, real))
-    return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items()}
+            shown = -np.expm1(-optical_depth(guide.density, stand.lattice, stand.seen(view)))
+            row[name] = _likeness(layer_of(shown), plume, frame, view)
+        rows.append(row)
+    return _means(rows)
 
 
 def judge_particles(plume: Plume, cameras: Cameras, records: list[VisualRecord]) -> dict[str, float]:
     """As `judge`, of the Gaussians of all frames, on the plume's own voxels; where levels lie is not asked."""
-    rows: dict[str, list[float]] = {}
+    rows = []
     for frame in _moments(plume):
         ours = particle_frame(records[frame])
+        grids = voxelize(ours, lattice_of(plume))
+        real = plume.density_at(frame), plume.velocity_at(frame)
+        row = _row((grids["density"], grids["velocity"]), real, axes=camera_axes(view_at(cameras, frame)))
         for name, view in _views(frame).items():
-            rows.setdefault(name, []).append(_likeness(picture(ours, view), plume, frame, view))
-        grids, real = voxelize(ours, lattice_of(plume)), plume.density_at(frame)
-        rows.setdefault("density", []).append(correlation(grids["density"], real))
-        axes = camera_axes(view_at(cameras, frame))
-        moves = velocity_scores(grids["velocity"], plume.velocity_at(frame), real, axes)
-        for name in ("sideways", "depth", "up"):
-            rows.setdefault(name, []).append(moves[f"correlation_{name}"])
-    return {name: round(float(np.nanmean(values)), 4) for name, values in rows.items()}
+            row[name] = _likeness(picture(ours, view), plume, frame, view)
+        rows.append(row)
+    return _means(rows)
+
+
+def _row(ours: tuple[np.ndarray, np.ndarray], real: tuple[np.ndarray, np.ndarray], *, axes: np.ndarray) -> dict[str, float]:
+    """Correlations of density [X, Y, Z] and velocity [X, Y, Z, 3]; axes [3, 3]: rows sideways, up and in depth."""
+    moves = velocity_scores(ours[1], real[1], real[0], axes)
+    return {"density": correlation(ours[0], real[0])} | {
+        name: moves[f"correlation_{name}"] for name in ("sideways", "depth", "up")
+    }
+
+
+def _means(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Of each name over the rows that have it."""
+    names = {name: None for row in rows for name in row}
+    return {name: round(float(np.nanmean([row[name] for row in rows if name in row])), 4) for name in names}
 
 
 def _moments(plume: Plume) -> list[int]:
@@ -154,7 +158,7 @@ def levels_off(ours: np.ndarray, real: np.ndarray) -> float:
 
 
 def judged(plume: Plume, prior: Prior, *, seed: int) -> dict[str, dict[str, float]]:
-    """By grid: as the pictures alone ask for it, and as the prior moves it."""
+    """Of volumes on grids as the pictures alone ask for them and as the prior moves them, and of particles made of the latter."""
     report = SilentReport()
     layers, cameras = film(plume, np.random.default_rng(seed))
     plan = volume.make_plan(layers, cameras, every=5)

@@ -122,16 +122,14 @@ def _smoke_of(plume: Plume, first: int, num_frames: int) -> _Smoke:
         top = VOXEL_SIZE * plume.density.shape[3]
         return _Smoke(middle=np.zeros(2), bottom=0.0, top=top, cell=top / CELLS_HIGH, speed=0.0)
     level, speed, weight = (np.concatenate(parts) for parts in (levels, speeds, weights))
-    order = np.argsort(speed)
-    reached = np.cumsum(weight[order], dtype=np.float64)
-    bottom, top = plume.origin[2] + VOXEL_SIZE * (level.min() - 0.5), plume.origin[2] + VOXEL_SIZE * (level.max() + 0.5)
+    bottom, top = (plume.origin[2] + VOXEL_SIZE * edge for edge in (level.min() - 0.5, level.max() + 0.5))
     wide = VOXEL_SIZE * float(np.quantile(widths, 0.9))
     return _Smoke(
         middle=np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass)),
         bottom=float(bottom),
         top=float(top),
         cell=float(max((top - bottom) / CELLS_HIGH, wide / CELLS_WIDE)),
-        speed=float(speed[order[np.searchsorted(reached, 0.5 * reached[-1])]]),
+        speed=float(np.quantile(speed, 0.5, weights=weight.astype(np.float64), method="inverted_cdf")),
     )
 
 
