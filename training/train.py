@@ -31,6 +31,7 @@ from backend.score.measures import correlation
 _HELD_BACK = 10  # every such plume
 _SCORED = 4  # every such lesson of those held back
 _SLOW = 0.2  # voxels a stride: motion that need not be known better than that
+_WORST = 2.0  # that the error of one lesson can count: a few show hardly any of the smoke that is there
 _BATCH = 8
 _FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
@@ -81,9 +82,14 @@ def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor,
     for (ours, moves), share in zip(answers, (0.5, 1.0), strict=True):
         of_density = (ours - density).square().sum((1, 2, 3)) / density.square().sum((1, 2, 3)).clamp_min(1e-3)
         of_velocity = (weight * (moves - velocity).square().sum(1)).sum((1, 2, 3)) / speed
-        total = total + share * (of_density.mean() + 0.5 * of_velocity.mean())
+        total = total + share * (bounded(of_density).mean() + 0.5 * bounded(of_velocity).mean())
         parts += [of_density.mean().item(), of_velocity.mean().item()]
     return total, parts
+
+
+def bounded(errors: Tensor) -> Tensor:
+    """What is to become small, of errors of any shape: as they are where small, at most _WORST."""
+    return _WORST * torch.tanh(errors / _WORST)
 
 
 def take_over(net: PlumeNet, state: dict[str, Tensor]) -> None:

@@ -52,5 +52,13 @@ def test_the_page_shows_how_right_the_volumes_are() -> None:
             assert f"| {way} | {name}, {len(those)} | {cells} |" in page
 
 
+def test_the_page_shows_what_levels_cost() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    results = json.loads((CHECKOUT / "docs" / "results" / "depth_levels.json").read_text(encoding="utf-8"))
+    for scene, ways in results.items():
+        for way, found in ways.items():
+            assert f"| {scene} | {way} | {found['density']:.3f} | {found['nvs_last_db']:.2f} | {found['side_db']:.2f} |" in page
+
+
 def test_the_weights_are_small() -> None:
     assert WEIGHTS.stat().st_size < 10_000_000

@@ -15,7 +15,7 @@ from training.lessons import write_lessons
 from training.library import NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume, read_plume
 from training.plumes import SIZE, plume
 from training.samples import draw_lesson
-from training.train import Lessons, take_over
+from training.train import Lessons, bounded, take_over
 
 SHAPE_OF_PLUME = tuple(round(size / VOXEL_SIZE) for size in SIZE)
 
@@ -129,3 +129,9 @@ def test_inputs_that_a_net_did_not_have_have_no_say_at_first(folder: Path, tmp_p
     with torch.no_grad():
         for ours, theirs in zip(new(sight, SHAPE)[1], old(sight, SHAPE)[1], strict=True):
             torch.testing.assert_close(ours, theirs)
+
+
+def test_a_lesson_that_cannot_be_solved_does_not_outweigh_the_others() -> None:
+    small, huge = bounded(torch.tensor([0.3])), bounded(torch.tensor([1e4]))
+    torch.testing.assert_close(small, torch.tensor([0.3]), rtol=0.01, atol=0.0)
+    assert huge < 10 * small
