@@ -31,6 +31,7 @@ from backend.geometry.camera import View, resized
 from backend.geometry.lattice import Lattice
 from backend.io.atomic import write_text
 from backend.io.job_folder import JobFolder
+from backend.io.particles import read_particles
 from backend.prior.window import Stand, stand_before
 from backend.score.exported import Exported
 from backend.score.measures import coded, correlation, decibels
@@ -59,6 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     missing = [scene for scene in scenes if not (given.jobs / scene / RESULT_FILE).is_file()]
     if missing:
         parser.error(f"{given.jobs} holds no finished job of {', '.join(missing)}; run benchmarks.reconstruction first.")
+    weights = {_weights_of(given.jobs / scene) for scene in scenes}
+    if len(weights) > 1:
+        parser.error(f"The jobs in {given.jobs} were fitted with different weights; fit them anew with one version.")
     found = {scene: scene_figures(given.jobs / scene, read_truth_set(given.source / scene)) for scene in scenes}
     found["mean"] = {
         way: {name: round(float(np.mean([found[scene][way][name] for scene in scenes])), 3) for name in FIGURES} for way in WAYS
@@ -68,8 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for way, figures in ways.items():
             print(f"{scene:<18} {way:<16} " + " ".join(f"{figures[name]:>11.3f}" for name in FIGURES))
     if given.json is not None:
-        write_text(given.json, json.dumps(found, indent=1, allow_nan=False) + "\n")
+        write_text(given.json, json.dumps({"weights": weights.pop(), "scenes": found}, indent=1, allow_nan=False) + "\n")
     return 0
+
+
+def _weights_of(job: Path) -> str | None:
+    """What the prior's weights of a job are known by; None without a prior."""
+    with read_particles(JobFolder(job).particles) as particles:
+        mark = particles.info.provenance.get("prior_fingerprint")
+    return mark and mark[:12]
 
 
 def scene_figures(job: Path, truth: Truth) -> dict[str, dict[str, float]]:

@@ -55,7 +55,8 @@ def test_the_page_shows_how_right_the_volumes_are() -> None:
 def test_the_page_shows_what_levels_cost() -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     results = json.loads((CHECKOUT / "docs" / "results" / "depth_levels.json").read_text(encoding="utf-8"))
-    for scene, ways in results.items():
+    assert results["weights"] == weights_fingerprint()[:12]
+    for scene, ways in results["scenes"].items():
         for way, found in ways.items():
             assert f"| {scene} | {way} | {found['density']:.3f} | {found['nvs_last_db']:.2f} | {found['side_db']:.2f} |" in page
 
