@@ -20,17 +20,17 @@ from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 
 _WHOLE = 0.65  # of the lessons: their pictures show all of the smoke, and the grid holds it
-_LEAST, _MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
-_LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
-_STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
-_STEP_SPREAD = 0.25  # of its logarithm
+LEAST, MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
+LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
+STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
+STEP_SPREAD = 0.25  # of its logarithm
 _SHORTEST = 15, 90  # frames of a clip, of one lesson in two
 _OFF, _OFTEN = (1.5, 4.5), (0.5, 0.5)  # voxels, by which grids stand beside the smoke: taught that they stand right, the prior
 # would leave those where they are that do not
-_LEAST_CELL = 0.2  # m; the plumes know nothing finer
+LEAST_CELL = 0.2  # m; the plumes know nothing finer
 _FRAMES = 5  # that tell where a clip's smoke is and how fast
 _EDGE = 0.03  # of the largest optical depth: where smoke ends
-_FOOT_FRAMES = 16  # that the source is looked for in
+FOOT_FRAMES = 16  # that the source is looked for in
 _MOST_DEPTH = 5.5  # what 8 bits of opacity tell
 
 
@@ -54,16 +54,16 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     candidates = [t for t in range(first, first + num_frames) if t % VELOCITY_EVERY == 0]
     moment = int(draw.choice(candidates))
     kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
-    smoke = _smoke_of(plume, first, num_frames)
+    smoke = smoke_of(plume, first, num_frames)
     is_whole = draw.random() < _WHOLE
-    cell = max(smoke.cell, _LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+    cell = max(smoke.cell, LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
     cut = max(smoke.top - smoke.bottom - CELLS_HIGH * cell, 0.0)  # what does not fit into the grid, mostly above
     height = 0.5 * (smoke.bottom + smoke.top) - draw.uniform(0.0, 0.6) * cut + draw.normal(0.0, cell)
     centre = np.array([*(smoke.middle + draw.normal(0.0, cell * draw.choice(_OFF, p=_OFTEN), 2)), height])
-    size = draw.integers(_LEAST_WHOLE if is_whole else _LEAST, _MOST, endpoint=True)
-    step = _STEP * cell * draw.lognormal(0.0, _STEP_SPREAD)
+    size = draw.integers(LEAST_WHOLE if is_whole else LEAST, MOST, endpoint=True)
+    step = STEP * cell * draw.lognormal(0.0, STEP_SPREAD)
     stride = int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
-    views = _views(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
+    views = camera_way(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = lattice_of(plume)
     noise = draw.choice([0.002, 0.01])
@@ -75,25 +75,29 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
         source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
         source += draw.normal(0.0, 0.8) * views[0].camera_to_world[:3, 2]
     else:
-        source = meeting_point(clear_depth_at, views, most_frames=_FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
+        source = meeting_point(clear_depth_at, views, most_frames=FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
 
     def depth_at(index: int) -> np.ndarray:
-        depth = clear_depth_at(index)
-        opacity = 1 - np.exp(-depth) + noise * draw.standard_normal(depth.shape).astype(np.float32)
-        return -np.log1p(-np.clip(opacity, 0.0, 1 - math.exp(-_MOST_DEPTH)))
+        return filmed(clear_depth_at(index), noise, draw)
 
     window = look(depth_at, lambda index: views[index], stand, source, moment - first, stride=stride, num_frames=num_frames)
     density, velocity = truth(plume, moment, stand)
     return Lesson(
-        window=replace(window, images=np.pad(window.images, ((0, 0), (0, _MOST[1] - size[1]), (0, _MOST[0] - size[0])))),
+        window=replace(window, images=np.pad(window.images, ((0, 0), (0, MOST[1] - size[1]), (0, MOST[0] - size[0])))),
         size=size,
         density=density * (cell / window.scale),
         velocity=velocity * (stride / FPS / cell),
     )
 
 
+def filmed(depth: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
+    """Optical depths as eight noisy bits of opacity tell them; noise: its standard deviation."""
+    opacity = 1 - np.exp(-depth) + noise * draw.standard_normal(depth.shape).astype(np.float32)
+    return -np.log1p(-np.clip(opacity, 0.0, 1 - math.exp(-_MOST_DEPTH)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Smoke:
+class Smoke:
     """Of a clip. middle [2] m: x and y; bottom, top: m; cell: m, the voxel of a grid that it fills; speed: m/s across a view."""
 
     middle: np.ndarray
@@ -103,7 +107,7 @@ class _Smoke:
     speed: float
 
 
-def _smoke_of(plume: Plume, first: int, num_frames: int) -> _Smoke:
+def smoke_of(plume: Plume, first: int, num_frames: int) -> Smoke:
     """Where a clip's smoke is and how fast; the whole world's where there is none."""
     frames = np.linspace(first, first + num_frames - 1, _FRAMES).round().astype(int) // VELOCITY_EVERY * VELOCITY_EVERY
     mass, levels, widths, speeds, weights = np.zeros(plume.density.shape[1:3]), [], [], [], []
@@ -120,11 +124,11 @@ def _smoke_of(plume: Plume, first: int, num_frames: int) -> _Smoke:
         weights.append(density[density > 0])
     if not mass.any():
         top = VOXEL_SIZE * plume.density.shape[3]
-        return _Smoke(middle=np.zeros(2), bottom=0.0, top=top, cell=top / CELLS_HIGH, speed=0.0)
+        return Smoke(middle=np.zeros(2), bottom=0.0, top=top, cell=top / CELLS_HIGH, speed=0.0)
     level, speed, weight = (np.concatenate(parts) for parts in (levels, speeds, weights))
     bottom, top = (plume.origin[2] + VOXEL_SIZE * edge for edge in (level.min() - 0.5, level.max() + 0.5))
     wide = VOXEL_SIZE * float(np.quantile(widths, 0.9))
-    return _Smoke(
+    return Smoke(
         middle=np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass)),
         bottom=float(bottom),
         top=float(top),
@@ -149,7 +153,9 @@ def truth(plume: Plume, moment: int, stand: Stand) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def _views(draw: np.random.Generator, kind: str, num_frames: int, *, height: float, pixel: float, size: np.ndarray) -> list[View]:
+def camera_way(
+    draw: np.random.Generator, kind: str, num_frames: int, *, height: float, pixel: float, size: np.ndarray
+) -> list[View]:
     """A camera on a tripod, on an orbit or walking by, that looks at `height` m with `size` pixels of `pixel` m."""
     rate = 0.0 if kind == "still" else draw.choice([-1, 1]) * draw.uniform(0.15, 0.7)  # degrees a frame
     start, elevation = draw.uniform(-180, 180), draw.uniform(2, 20)

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from backend.io.atomic import whole_file
+from backend.prior.levels import read_level_net
 from backend.prior.network import PlumeNet, Sight
 from backend.prior.predict import SHAPE, read_weights, save_weights
 from backend.prior.window import NUM_CONDITIONS, OFFSETS
@@ -182,7 +183,7 @@ def main(arguments: list[str]) -> int:
             kept = {"net": net.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
             torch.save({**kept, "passes": number + 1}, part)
         with whole_file(given.out / "plumes.npz") as part, open(part, "wb") as file:
-            save_weights(mean, file)
+            save_weights(mean, file, read_level_net(given.start) if given.start else None)
     return 0
 
 

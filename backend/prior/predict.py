@@ -14,6 +14,7 @@ import torch
 
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
+from backend.prior.levels import NAME, LevelNet, level_arrays, read_level_net
 from backend.prior.network import PlumeNet, Sight
 from backend.prior.weights import HINT, WEIGHTS
 from backend.prior.window import Stand, look, stand_before
@@ -31,11 +32,12 @@ class Proposal:
 
 
 class Prior:
-    """The trained network; several threads may ask it at once. Raises BackendError where its weights cannot be read."""
+    """The trained networks; several threads may ask them at once. levels: the small one, where the file holds one. Raises
+    BackendError where its weights cannot be read."""
 
     def __init__(self, weights: Path = WEIGHTS) -> None:
         try:
-            self.net = _read_net(weights)
+            self.net, self.levels = read_net(weights), read_level_net(weights)
         except (OSError, EOFError, BadZipFile, KeyError, ValueError, TypeError, RuntimeError) as error:
             message = f"{weights} does not hold the weights of this version's prior."
             raise BackendError("prior_unreadable", message, hint=HINT) from error
@@ -74,13 +76,15 @@ class Prior:
 
 
 def read_weights(weights: Path) -> tuple[tuple[int, ...], dict[str, torch.Tensor]]:
-    """The network's widths, and its parameters by name, float32."""
+    """The large network's widths, and its parameters by name, float32."""
     with np.load(weights, allow_pickle=False) as arrays:
         widths = tuple(int(width) for width in arrays["widths"])
-        return widths, {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files if name != "widths"}
+        names = [name for name in arrays.files if name != "widths" and not name.startswith(NAME)]
+        return widths, {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names}
 
 
-def _read_net(weights: Path) -> PlumeNet:
+def read_net(weights: Path) -> PlumeNet:
+    """The large network."""
     widths, state = read_weights(weights)
     net = PlumeNet(widths)
     net.load_state_dict(state)
@@ -102,7 +106,15 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def save_weights(net: PlumeNet, file: BinaryIO) -> None:
-    """As float16: half the size, and no figure changes."""
-    arrays = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()}
-    np.savez_compressed(file, widths=np.array(net.widths), **arrays)  # type: ignore[arg-type]
+def save_weights(net: PlumeNet, file: BinaryIO, levels: LevelNet | None = None) -> None:
+    """As float16 of nine bits for ten: less than half the size, and no figure changes."""
+    arrays = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()} | level_arrays(
+        levels
+    )
+    rounded = {name: _rounded(values) for name, values in arrays.items()}
+    np.savez_compressed(file, widths=np.array(net.widths), **rounded)  # type: ignore[arg-type]
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """float16 to the next with an even last bit: what is packed is smaller by one bit of each."""
+    return ((values.view(np.uint16) + np.uint16(1)) & np.uint16(0xFFFE)).view(np.float16)

@@ -77,12 +77,17 @@ class Stand:
         return camera @ np.concatenate([size * rotation, offset[:, None]], axis=1)
 
 
-def stand_before(view: View, centre: np.ndarray, *, voxel_size: float, shape: tuple[int, int, int]) -> Stand:
-    """The grid with its middle at `centre` [3] m, turned towards a view."""
+def away_of(view: View) -> np.ndarray:
+    """[3] of length 1: level, away from a camera; of one that looks straight down or up, the way its pictures' tops point."""
     away = view.camera_to_world[:3, 2] * (1.0, 1.0, 0.0)
     if np.linalg.norm(away) < 1e-6:
-        away = -view.camera_to_world[:3, 1] * (1.0, 1.0, 0.0)  # it looks straight down or up
-    away = away / np.linalg.norm(away)
+        away = -view.camera_to_world[:3, 1] * (1.0, 1.0, 0.0)
+    return away / np.linalg.norm(away)
+
+
+def stand_before(view: View, centre: np.ndarray, *, voxel_size: float, shape: tuple[int, int, int]) -> Stand:
+    """The grid with its middle at `centre` [3] m, turned towards a view."""
+    away = away_of(view)
     up = np.array([0.0, 0.0, 1.0])
     from_world = np.eye(4)
     from_world[:3, :3] = np.stack([np.cross(away, up), away, up])

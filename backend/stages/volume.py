@@ -18,6 +18,7 @@ from backend.contract.cameras import Cameras
 from backend.fit.between import between
 from backend.fit.guide import Guide
 from backend.fit.lasting import Lasting
+from backend.fit.levelled import Levels
 from backend.fit.pace import stride_of
 from backend.fit.region import ROUNDS, Region, find_region, num_probes
 from backend.fit.scene import make_scene
@@ -141,10 +142,14 @@ def propose(
     done: Series[VolumeRecord],
     num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
-    """Yields what the prior says of the asked frames behind those that are `done`, in the upright world."""
+    """Yields what the prior says of the asked frames behind those that are `done`, in the upright world: each frame's own word,
+    with its levels where the whole clip says that they are."""
     num_done = len(done)
+    levels = None if prior.levels is None else Levels(plan.region, prior.levels, stride=plan.stride)
     answers = _answers(plan, report, plan.asked[num_done:], prior, num_workers, done=_LONGER * (plan.probes + num_done))
-    yield from (_packed(answer, answer.stand.from_world) for answer in answers)
+    for frame, answer in zip(plan.asked[num_done:], answers, strict=True):
+        found = answer if levels is None else levels.levelled(answer, frame)
+        yield _packed(found, answer.stand.from_world)
 
 
 def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator[VolumeRecord]:

@@ -20,6 +20,7 @@ from backend.fit.scene import make_scene, turned_about
 from backend.fit.sharpen import SHARPNESS, sharpened
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
+from backend.prior.levels import LevelNet
 from backend.prior.network import PlumeNet
 from backend.prior.predict import SHAPE, Prior, Proposal, save_weights
 from backend.prior.window import Stand, stand_before
@@ -41,7 +42,7 @@ def prior(tmp_path_factory: pytest.TempPathFactory) -> Prior:
     for part in (net.first, net.second):
         torch.nn.init.normal_(part.exit.weight, std=0.2)
     file = io.BytesIO()
-    save_weights(net, file)
+    save_weights(net, file, LevelNet(16))
     path: Path = tmp_path_factory.mktemp("prior") / "weights.npz"
     path.write_bytes(file.getvalue())
     return Prior(path)

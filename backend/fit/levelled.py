@@ -1,0 +1,94 @@
+"""Levels of a proposal brought to where in depth the whole clip says that they are.
+
+Two networks speak of it: the large one, for a frame, of every voxel, and a small one, from the whole clip, of the levels' middles
+and of how unsure it is of them. What they get wrong they get wrong in part apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from backend.fit.region import Region
+from backend.prior.levels import LevelNet, ask
+from backend.prior.predict import Proposal, one_thread
+from backend.prior.sheets import UNIT, look_at_sheets, moments_around, parts
+from backend.prior.window import Stand
+
+OWN_ERROR = 1.5  # voxels that the middle of a proposal's level is taken to be off; tuned on the plumes that sharpness was
+_SMOOTH = 1.5  # voxels of height, standard deviation: neighbouring levels move alike
+_FAINT = 0.01  # of the fullest level: one with less does not move of itself
+
+
+class Levels:
+    """Of a clip, in its upright world. stride: frames."""
+
+    def __init__(self, region: Region, net: LevelNet, *, stride: int) -> None:
+        self.region, self.net, self.stride = region, net, stride
+        self.known: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
+
+    def levelled(self, proposal: Proposal, frame: int) -> Proposal:
+        """Each level moved along the view, with its velocities: the more of the way the surer the small network is."""
+        stand = proposal.stand
+        columns = proposal.density.sum(axis=1, dtype=np.float64)  # [X, Z]
+        mass = columns.sum(axis=0)
+        middle, unsure, asked = self._said(stand, frame)
+        counted = columns * asked
+        own = np.einsum("xyz,y->z", proposal.density, np.arange(proposal.density.shape[1])) / np.maximum(mass, 1e-12)
+        aim = (counted * middle).sum(axis=0) / np.maximum(counted.sum(axis=0), 1e-12)
+        trust = OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
+        weight = np.where((counted.sum(axis=0) > 0) & (mass > _FAINT * mass.max(initial=0.0)), mass, 0.0)
+        if not weight.any():
+            return proposal
+        weight /= weight.max()
+        total = ndimage.gaussian_filter1d(weight, _SMOOTH, mode="constant")
+        shift = ndimage.gaussian_filter1d(weight * trust * (aim - own), _SMOOTH, mode="constant") / (total + 1e-6)
+        return replace(
+            proposal, density=moved(proposal.density, shift), velocity=moved(proposal.velocity, shift, outside="nearest")
+        )
+
+    def _said(self, stand: Stand, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For the grid of a frame: where the middle of each column's smoke is [X, Z] voxels, of each level how unsure that is [Z]
+        voxels, and whether the level was asked [Z], from 0 to 1."""
+        frames = moments_around(frame, stride=self.stride, num_frames=len(self.region.depths))
+        heights, *said = self._heard(frames)
+        later = int(np.clip(np.searchsorted(frames, frame), 1, len(frames) - 1))
+        share = np.clip((frame - frames[later - 1]) / max(int(frames[later] - frames[later - 1]), 1), 0.0, 1.0)
+        middle, unsure, asked = ((1.0 - share) * values[later - 1] + share * values[later] for values in said)
+        own, source = stand.centres()[0, 0, :, 2], stand.voxels(self.region.source[None])[0]
+        at = (np.arange(stand.lattice.shape[0]) - source[0]) / UNIT
+        across = [np.interp(at, parts(), row) for row in middle]  # of each level [X]
+        deep = np.stack([np.interp(own, heights, column) for column in np.transpose(across)])
+        return source[1] + UNIT * deep, UNIT * np.interp(own, heights, unsure), np.interp(own, heights, asked)
+
+    def _heard(self, frames: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Heights [Z] m, and what the network says of these frames; windows that reach as far are heard once."""
+        key = int(frames[0]), int(frames[-1])
+        if key not in self.known:
+            region = self.region
+            sheets = look_at_sheets(
+                lambda number: region.depths[number],
+                lambda number: region.views[number],
+                region.source,
+                frames,
+                height=float(region.centre[2]),
+                voxel_size=region.voxel_size,
+                stride=self.stride,
+            )
+            with one_thread():
+                self.known[key] = sheets.heights, *ask(self.net, sheets)
+        return self.known[key]
+
+
+def moved(values: np.ndarray, shift: np.ndarray, *, outside: str = "constant") -> np.ndarray:
+    """Values [X, Y, Z, ..] of a grid whose levels move by shift [Z] voxels along Y, linearly; float32."""
+    reach = int(np.ceil(np.abs(shift).max(initial=0.0))) + 1
+    mode = "edge" if outside == "nearest" else "constant"
+    padded = np.pad(values, [(0, 0), (reach, reach)] + [(0, 0)] * (values.ndim - 2), mode=mode)
+    at = np.arange(values.shape[1])[:, None] + reach - shift  # [Y, Z]
+    low = np.floor(at).astype(np.int64)
+    share = (at - low).astype(np.float32).reshape(*at.shape, *[1] * (values.ndim - 3))
+    level = np.arange(values.shape[2])
+    return (1 - share) * padded[:, low, level] + share * padded[:, low + 1, level]
