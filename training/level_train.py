@@ -30,8 +30,10 @@ from training.train import held_back
 _BATCH = 32
 _WORST = 1.0  # that one clip's error can count
 _OF_PARTS, _OF_WIDTH, _OF_DOUBT = 0.5, 0.3, 0.05
-_SHEARED = 0.6  # of the clips
+_RESHAPED = 0.6  # of the clips, in each way
+_FOOT = 0.08  # units that all levels are moved by
 _LEAN, _BEND = 0.05, 0.05  # of height, that levels are moved by; the second at the top of a window
+_WIDER = 0.12  # of the logarithm of the width
 _FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
 
@@ -60,42 +62,47 @@ def mirrored(part: dict[str, Tensor]) -> dict[str, Tensor]:
     return found
 
 
-def sheared(part: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Levels moved sideways and in depth, the same all the time: smoke that a steady wind bends; no divergence comes of it."""
+def reshaped(part: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Smoke moved sideways and in depth, the more the higher and the same all the time, as a steady wind bends it: no divergence
+    comes of that; its foot moved a little, as the source is found a little beside; and all of it made wider or narrower."""
     count = len(part["mass"])
     height = 4 * part["clues"][:, HEIGHT, 0].clamp_min(0.0)  # [B, Z] units
-    lean = (torch.rand(count, 1) < _SHEARED) * _LEAN * torch.randn(count, 2)
-    bend = (torch.rand(count, 1) < _SHEARED) * _BEND * torch.randn(count, 2)
-    moved = height[..., None] * (lean[:, None] + bend[:, None] * height[..., None] / 8)  # [B, Z, 2]
+    foot, lean, bend = ((torch.rand(count, 1) < _RESHAPED) * much * torch.randn(count, 2) for much in (_FOOT, _LEAN, _BEND))
+    size = torch.exp((torch.rand(count) < _RESHAPED) * _WIDER * torch.randn(count))
+    moved = foot[:, None] + height[..., None] * (lean[:, None] + bend[:, None] * height[..., None] / 8)  # [B, Z, 2]
     cosine, sine = part["turns"][:, 0, :, None], part["turns"][:, 1, :, None]
     across = cosine * moved[:, None, :, 0] + sine * moved[:, None, :, 1]
     deeper = cosine * moved[:, None, :, 1] - sine * moved[:, None, :, 0]
     by = across * (UNIT / PART)
-    mass = _shifted(part["mass"], by)
-    middle = _shifted(part["mass"] * part["middle"], by) / mass.clamp_min(1e-7) + deeper[..., None]
-    return part | {"profile": _shifted(part["profile"], by), "mass": mass, "middle": middle * (mass > 1e-7)}
+    mass = _drawn(part["mass"], by, size)
+    middle = _drawn(part["mass"] * part["middle"], by, size) / mass.clamp_min(1e-7)
+    middle = (size[:, None, None, None] * middle + deeper[..., None]) * (mass > 1e-7)
+    width = part["width"] + size.log()[:, None, None]
+    return part | {"profile": _drawn(part["profile"], by, size), "mass": mass, "middle": middle, "width": width}
 
 
-def _shifted(values: Tensor, by: Tensor) -> Tensor:
-    """[B, T, Z, X] moved by [B, T, Z] steps along X, linearly."""
+def _drawn(values: Tensor, by: Tensor, size: Tensor) -> Tensor:
+    """[B, T, Z, X], `size` [B] times as wide about the middle of X and moved by [B, T, Z] steps along it; linearly."""
     rows = values.reshape(-1, values.shape[-1]).numpy()
-    return torch.from_numpy(_shift_rows(rows, by.reshape(-1).numpy(), np.empty_like(rows))).reshape(values.shape)
+    sizes = size[:, None, None].expand(by.shape).reshape(-1).numpy()
+    return torch.from_numpy(_draw_rows(rows, by.reshape(-1).numpy(), sizes, np.empty_like(rows))).reshape(values.shape)
 
 
 @njit(cache=True)
-def _shift_rows(rows, by, found):
-    size = rows.shape[1]
+def _draw_rows(rows, by, sizes, found):
+    count = rows.shape[1]
+    middle = 0.5 * (count - 1)
     for index in range(len(rows)):
-        low = math.floor(-by[index])
-        share = np.float32(-by[index] - low)
-        for x in range(size):
-            first = x + low
+        for x in range(count):
+            at = middle + (x - middle - by[index]) / sizes[index]
+            low = math.floor(at)
+            share = np.float32(at - low)
             value = np.float32(0.0)
-            if 0 <= first < size:
-                value += (np.float32(1.0) - share) * rows[index, first]
-            if 0 <= first + 1 < size:
-                value += share * rows[index, first + 1]
-            found[index, x] = value
+            if 0 <= low < count:
+                value += (np.float32(1.0) - share) * rows[index, low]
+            if 0 <= low + 1 < count:
+                value += share * rows[index, low + 1]
+            found[index, x] = value / sizes[index]
     return found
 
 
@@ -159,7 +166,7 @@ def main(arguments: list[str]) -> int:
         done = step / given.steps
         for group in optimiser.param_groups:
             group["lr"] = given.rate * min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * done))
-        part = sheared(clips.batch(torch.randint(len(clips), (_BATCH,))))
+        part = reshaped(clips.batch(torch.randint(len(clips), (_BATCH,))))
         if step % 2:
             part = mirrored(part)
         of_level, of_parts, of_width, unlikely = errors(net, part)

@@ -18,7 +18,7 @@ from backend.prior.predict import SHAPE, Prior, Proposal, read_weights, save_wei
 from backend.prior.sheets import HEIGHT, NUM_LEVELS, NUM_MOMENTS, NUM_PARTS, UNIT, Sheets, look_at_sheets, moments_around
 from backend.prior.window import away_of, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
-from training.level_train import mirrored, sheared
+from training.level_train import mirrored, reshaped
 
 NUM_FRAMES = 60
 VOXEL = 0.4
@@ -64,7 +64,7 @@ def sheets_of(
 def as_lesson(sheets: Sheets) -> dict[str, torch.Tensor]:
     names = ("profile", "turns", "clues")
     part = {name: torch.from_numpy(getattr(sheets, name))[None] for name in names}
-    return part | {"mass": part["profile"], "middle": torch.zeros_like(part["profile"])}
+    return part | {"mass": part["profile"], "middle": torch.zeros_like(part["profile"]), "width": part["profile"].sum(-1)}
 
 
 def seen(part: dict[str, torch.Tensor]) -> np.ndarray:
@@ -121,9 +121,9 @@ def test_a_mirror_shows_what_lessons_in_a_mirror_show() -> None:
 def test_a_sheared_lesson_is_one_of_smoke_that_leans_more(monkeypatch: pytest.MonkeyPatch) -> None:
     sheets = sheets_of(leaning())
     monkeypatch.setattr(torch, "rand", lambda *size: torch.zeros(size))  # every clip
-    draws = iter([torch.tensor([[0.1, -0.2]]) / 0.05, torch.zeros(1, 2)])  # a lean and no bend
+    draws = iter([torch.zeros(1, 2), torch.tensor([[0.1, -0.2]]) / 0.05, torch.zeros(1, 2), torch.zeros(1)])  # a lean, no more
     monkeypatch.setattr(torch, "randn", lambda *_: next(draws))
-    part = sheared(as_lesson(sheets))
+    part = reshaped(as_lesson(sheets))
     frames = moments_around(30, stride=2, num_frames=NUM_FRAMES)
     away = away_of(view(int(frames[NUM_MOMENTS // 2])))
     right = np.cross(away, [0.0, 0.0, 1.0])
@@ -136,6 +136,22 @@ def test_a_sheared_lesson_is_one_of_smoke_that_leans_more(monkeypatch: pytest.Mo
     lean = (part["middle"] * part["mass"]).sum(-1)[0] / part["mass"].sum(-1)[0].clamp_min(1e-6)
     np.testing.assert_allclose(lean.numpy()[asked], (truth - behind(sheets, LEAN))[asked], atol=0.02)
     assert (4 * sheets.clues[HEIGHT, 0] >= -1).all()
+
+
+def test_a_widened_lesson_is_one_of_wider_smoke(monkeypatch: pytest.MonkeyPatch) -> None:
+    sheets = sheets_of(leaning())
+    monkeypatch.setattr(torch, "rand", lambda *size: torch.zeros(size))
+    draws = iter([torch.zeros(1, 2), torch.zeros(1, 2), torch.zeros(1, 2), torch.full((1,), float(np.log(1.3) / 0.12))])
+    monkeypatch.setattr(torch, "randn", lambda *_: next(draws))
+    before = as_lesson(sheets)
+    before["middle"] += 0.2
+    part = reshaped(before)
+    here, there = seen(before), seen(part)
+    asked = (here[ASKED] > 0) & (there[ASKED] > 0) & (np.abs(here[4]) < 1.5)
+    np.testing.assert_allclose(there[4][asked], 1.3 * here[4][asked], atol=0.02)
+    np.testing.assert_allclose(part["middle"][part["mass"] > 1e-3], 0.26, atol=1e-4)
+    np.testing.assert_allclose(part["width"] - before["width"], np.log(1.3), rtol=1e-4)
+    np.testing.assert_allclose(part["mass"].sum(-1)[0].numpy()[asked], before["mass"].sum(-1)[0].numpy()[asked], rtol=0.05)
 
 
 @pytest.mark.parametrize(("frame", "first", "last"), [(0, 0, 60), (100, 70, 130), (199, 139, 199)])
