@@ -8,7 +8,6 @@ DIR/0001.npz   profile and mass [N, T, Z, X] uint8: 255 sqrt of a share; turns [
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import cache
 from pathlib import Path
@@ -16,26 +15,24 @@ from pathlib import Path
 import numpy as np
 
 from backend.field.rays import optical_depth
-from backend.fit.pace import longest_stride
 from backend.fit.region import CELLS_HIGH, PIXELS_A_CELL
 from backend.fit.scene import meeting_point
 from backend.io.atomic import whole_file
 from backend.prior.sheets import NUM_PARTS, PART, UNIT, look_at_sheets, moments_around
 from backend.prior.window import away_of
-from synthetic.progress import Progress
-from training.library import FPS, NUM_FRAMES, VOXEL_SIZE, Plume, read_plume
+from training.lessons import draw_some, write_all
+from training.library import NUM_FRAMES, VOXEL_SIZE, Plume, read_plume
 from training.samples import (
     FOOT_FRAMES,
     LEAST,
-    LEAST_CELL,
     LEAST_WHOLE,
     MOST,
-    STEP,
-    STEP_SPREAD,
     camera_way,
+    cell_for,
     filmed,
     lattice_of,
     smoke_of,
+    stride_for,
 )
 
 _SHORTEST = 30, 90  # frames of a clip, as often as the other
@@ -52,14 +49,13 @@ def draw_clip(plume: Plume, draw: np.random.Generator) -> dict[str, np.ndarray] 
     kind = draw.choice(["orbit", "wild"], p=[0.8, 0.2])
     smoke = smoke_of(plume, first, num_frames)
     is_whole = draw.random() < _WHOLE
-    cell = max(smoke.cell, LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+    cell = cell_for(smoke, draw, is_whole=is_whole)
     cut = max(smoke.top - smoke.bottom - CELLS_HIGH * cell, 0.0)
     height = 0.5 * (smoke.bottom + smoke.top) - draw.uniform(0.0, 0.6) * cut + draw.normal(0.0, cell)
     size = draw.integers(LEAST_WHOLE if is_whole else LEAST, MOST, endpoint=True)
     if draw.random() < _ROOMY:
         size = (size * draw.uniform(1.0, 2.0, 2)).astype(int)
-    step = STEP * cell * draw.lognormal(0.0, STEP_SPREAD)
-    stride = int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
+    stride = stride_for(smoke, draw, cell=cell, num_frames=num_frames)
     views = camera_way(draw, kind, num_frames, height=height, pixel=_COARSE * cell / PIXELS_A_CELL, size=size // _COARSE)
     lattice, noise = lattice_of(plume), draw.choice([0.002, 0.01])
 
@@ -96,6 +92,8 @@ def draw_clip(plume: Plume, draw: np.random.Generator) -> dict[str, np.ndarray] 
         return mass.T, (mean / safe).T, np.sqrt(np.maximum(spread, 1e-3))
 
     mass, middle, width = (np.stack(part) for part in zip(*(true_at(int(frame)) for frame in frames), strict=True))
+    if not mass.any():
+        return None
     return {
         "profile": coded(sheets.profile),
         "turns": sheets.turns.astype(np.float16),
@@ -121,33 +119,11 @@ def write_lessons(plume: Path, target: Path, *, seed: int, count: int) -> None:
     """Draw `count` clips of one plume, or leave the file that is there."""
     if target.exists():
         return
-    recording, drawn = read_plume(plume), []
-    for number in range(10 * count):
-        clip = draw_clip(recording, np.random.default_rng([seed, number]))
-        if clip is not None and clip["mass"].any():
-            drawn.append(clip)
-        if len(drawn) == count:
-            break
+    drawn = draw_some(draw_clip, read_plume(plume), seed=seed, count=count)
     arrays = {name: np.stack([clip[name] for clip in drawn]) for name in drawn[0]}
     with whole_file(target) as part, open(part, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--plumes", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", default="0:120", help="A:B")
-    parser.add_argument("--each", type=int, default=100)
-    given = parser.parse_args(arguments)
-    first, stop = map(int, given.seeds.split(":"))
-    given.out.mkdir(parents=True, exist_ok=True)
-    progress = Progress(label="draw clips", total=stop - first)
-    for seed in range(first, stop):
-        write_lessons(given.plumes / f"{seed:04d}", given.out / f"{seed:04d}.npz", seed=seed, count=given.each)
-        progress.step()
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(write_all(sys.argv[1:], write_lessons, description=__doc__, each=100))

@@ -25,7 +25,7 @@ from backend.io.atomic import whole_file
 from backend.prior.levels import LevelNet, features_of, read_level_net
 from backend.prior.predict import read_net, save_weights
 from backend.prior.sheets import HEIGHT, PART, UNIT
-from training.train import held_back
+from training.train import Stored, bounded, held_back
 
 _BATCH = 32
 _WORST = 1.0  # that one clip's error can count
@@ -37,15 +37,8 @@ _WIDER = 0.12  # of the logarithm of the width
 _FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
 
-class Clips:
-    """All in memory."""
-
-    def __init__(self, paths: list[Path]) -> None:
-        parts = [np.load(path) for path in paths]
-        self.arrays = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0].files}
-
-    def __len__(self) -> int:
-        return len(self.arrays["mass"])
+class Clips(Stored):
+    """A batch as float32, shares as they were."""
 
     def batch(self, indices: Tensor) -> dict[str, Tensor]:
         found = {name: array[indices].float() for name, array in self.arrays.items()}
@@ -170,8 +163,8 @@ def main(arguments: list[str]) -> int:
         if step % 2:
             part = mirrored(part)
         of_level, of_parts, of_width, unlikely = errors(net, part)
-        bounded = [_WORST * torch.tanh(each / _WORST) for each in (of_level, of_parts, of_width)]
-        loss = (bounded[0] + _OF_PARTS * bounded[1] + _OF_WIDTH * bounded[2]).mean() + _OF_DOUBT * unlikely.mean()
+        terms = [bounded(each, worst=_WORST) for each in (of_level, of_parts, of_width)]
+        loss = (terms[0] + _OF_PARTS * terms[1] + _OF_WIDTH * terms[2]).mean() + _OF_DOUBT * unlikely.mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)

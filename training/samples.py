@@ -22,12 +22,12 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 _WHOLE = 0.65  # of the lessons: their pictures show all of the smoke, and the grid holds it
 LEAST, MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
 LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
-STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
-STEP_SPREAD = 0.25  # of its logarithm
+_STEP = 1.35  # voxels that smoke moves in a stride, where a fit sees 0.9 in the pictures: rays mix what goes many ways
+_STEP_SPREAD = 0.25  # of its logarithm
 _SHORTEST = 15, 90  # frames of a clip, of one lesson in two
 _OFF, _OFTEN = (1.5, 4.5), (0.5, 0.5)  # voxels, by which grids stand beside the smoke: taught that they stand right, the prior
 # would leave those where they are that do not
-LEAST_CELL = 0.2  # m; the plumes know nothing finer
+_LEAST_CELL = 0.2  # m; the plumes know nothing finer
 _FRAMES = 5  # that tell where a clip's smoke is and how fast
 _EDGE = 0.03  # of the largest optical depth: where smoke ends
 FOOT_FRAMES = 16  # that the source is looked for in
@@ -56,13 +56,12 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
     smoke = smoke_of(plume, first, num_frames)
     is_whole = draw.random() < _WHOLE
-    cell = max(smoke.cell, LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+    cell = cell_for(smoke, draw, is_whole=is_whole)
     cut = max(smoke.top - smoke.bottom - CELLS_HIGH * cell, 0.0)  # what does not fit into the grid, mostly above
     height = 0.5 * (smoke.bottom + smoke.top) - draw.uniform(0.0, 0.6) * cut + draw.normal(0.0, cell)
     centre = np.array([*(smoke.middle + draw.normal(0.0, cell * draw.choice(_OFF, p=_OFTEN), 2)), height])
     size = draw.integers(LEAST_WHOLE if is_whole else LEAST, MOST, endpoint=True)
-    step = STEP * cell * draw.lognormal(0.0, STEP_SPREAD)
-    stride = int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
+    stride = stride_for(smoke, draw, cell=cell, num_frames=num_frames)
     views = camera_way(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
     stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = lattice_of(plume)
@@ -135,6 +134,17 @@ def smoke_of(plume: Plume, first: int, num_frames: int) -> Smoke:
         cell=float(max((top - bottom) / CELLS_HIGH, wide / CELLS_WIDE)),
         speed=float(np.quantile(speed, 0.5, weights=weight.astype(np.float64), method="inverted_cdf")),
     )
+
+
+def cell_for(smoke: Smoke, draw: np.random.Generator, *, is_whole: bool) -> float:
+    """m: the voxel of a grid that holds all of the smoke, give or take, or only part of it."""
+    return max(smoke.cell, _LEAST_CELL) * (draw.uniform(0.95, 1.1) if is_whole else draw.uniform(0.6, 0.95))
+
+
+def stride_for(smoke: Smoke, draw: np.random.Generator, *, cell: float, num_frames: int) -> int:
+    """Frames in which smoke goes about as far as a fit sees to, of a clip of `num_frames`."""
+    step = _STEP * cell * draw.lognormal(0.0, _STEP_SPREAD)
+    return int(np.clip(round(step * FPS / max(smoke.speed, 1e-3)), 1, longest_stride(num_frames)))
 
 
 def lattice_of(plume: Plume) -> Lattice:

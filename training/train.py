@@ -37,15 +37,19 @@ _BATCH = 8
 _FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
 
-class Lessons:
-    """All lessons in memory; a batch as float32."""
+class Stored:
+    """All lessons of some files, in memory."""
 
     def __init__(self, paths: list[Path]) -> None:
         parts = [np.load(path) for path in paths]
         self.arrays = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0].files}
 
     def __len__(self) -> int:
-        return len(self.arrays["density"])
+        return len(next(iter(self.arrays.values())))
+
+
+class Lessons(Stored):
+    """A batch as float32."""
 
     def batch(self, indices: Tensor, mirrored: bool) -> tuple[Sight, Tensor, Tensor]:
         """What is seen, density and velocity; mirrored: left and right exchanged."""
@@ -88,9 +92,9 @@ def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor,
     return total, parts
 
 
-def bounded(errors: Tensor) -> Tensor:
-    """What is to become small, of errors of any shape: as they are where small, at most _WORST."""
-    return _WORST * torch.tanh(errors / _WORST)
+def bounded(errors: Tensor, *, worst: float = _WORST) -> Tensor:
+    """What is to become small, of errors of any shape: as they are where small, at most `worst`."""
+    return worst * torch.tanh(errors / worst)
 
 
 def take_over(net: PlumeNet, state: dict[str, Tensor]) -> None:
