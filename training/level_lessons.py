@@ -21,7 +21,7 @@ from backend.io.atomic import whole_file
 from backend.prior.sheets import NUM_PARTS, PART, UNIT, look_at_sheets, moments_around
 from backend.prior.window import away_of
 from training.lessons import draw_some, write_all
-from training.library import NUM_FRAMES, VOXEL_SIZE, Plume, read_plume
+from training.library import NUM_FRAMES, Plume, read_plume
 from training.samples import (
     FOOT_FRAMES,
     LEAST,
@@ -74,7 +74,7 @@ def draw_clip(plume: Plume, draw: np.random.Generator) -> dict[str, np.ndarray] 
     source = meeting_point(lambda index: clear_depth_at(foot[index]), [views[frame] for frame in foot], most_frames=len(foot))
     source = source + draw.normal(0.0, 0.15, 3)
     sheets = look_at_sheets(depth_at, lambda index: views[index], source, frames, height=height, voxel_size=cell, stride=stride)
-    levels = lattice.origin[2] + VOXEL_SIZE * np.arange(lattice.shape[2])
+    levels = lattice.origin[2] + plume.voxel_size * np.arange(lattice.shape[2])
     at_height = _between(sheets.heights, levels)
     places = np.stack(np.meshgrid(*lattice.axes()[:2], indexing="ij"), axis=-1).reshape(-1, 2) - source[:2]
 

@@ -4,7 +4,7 @@ DIR/0001/density.npy   [F, X, Y, Z] uint8: 255 sqrt(density / MOST_DENSITY), eve
 DIR/0001/velocity.npy  [F / VELOCITY_EVERY, X, Y, Z, 3] float16 m/s, every VELOCITY_EVERY frames
 DIR/0001/plume.json    where the voxels lie; written last
 
-.venv/backend/bin/python -m training.library --out DIR --seeds 0:150
+.venv/backend/bin/python -m training.library --out DIR --seeds 0:150 [--voxel-size 0.5]
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ MOST_DENSITY = 9.0  # 1/m; more is cut off
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plume:
-    """One simulated plume, mapped into memory. origin: centre of the first voxel, m."""
+    """One simulated plume, mapped into memory. origin: centre of the first voxel, m; voxel_size m."""
 
     scene: SmokeScene
     density: np.ndarray
     velocity: np.ndarray
     origin: tuple[float, float, float]
+    voxel_size: float = VOXEL_SIZE
 
     def density_at(self, frame: int) -> np.ndarray:
         """[X, Y, Z] float32 1/m."""
@@ -50,12 +51,12 @@ class Plume:
         return np.asarray(self.velocity[frame // VELOCITY_EVERY], np.float32)
 
 
-def simulate(seed: int, folder: Path) -> None:
+def simulate(seed: int, folder: Path, *, voxel_size: float) -> None:
     """Write a plume, or leave the one that is there."""
     if (folder / "plume.json").exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
-    simulation = prepare(plume(seed), voxel_size=VOXEL_SIZE, time_step=1 / FPS)
+    simulation = prepare(plume(seed), voxel_size=voxel_size, time_step=1 / FPS)
     densities, velocities = [], []
     for frame, state in enumerate(run(simulation, num_frames=NUM_FRAMES, fps=FPS)):
         densities.append(coded(state.density))
@@ -65,7 +66,8 @@ def simulate(seed: int, folder: Path) -> None:
         with whole_file(folder / f"{name}.npy") as part, open(part, "wb") as file:
             np.save(file, np.stack(stack))
     with whole_file(folder / "plume.json") as part:
-        part.write_text(json.dumps({"seed": seed, "origin": simulation.grid.first_centre}), encoding="utf-8")
+        told = {"seed": seed, "origin": simulation.grid.first_centre, "voxel_size": voxel_size}
+        part.write_text(json.dumps(told), encoding="utf-8")
 
 
 def coded(density: np.ndarray) -> np.ndarray:
@@ -76,18 +78,20 @@ def coded(density: np.ndarray) -> np.ndarray:
 def read_plume(folder: Path) -> Plume:
     told = json.loads((folder / "plume.json").read_text(encoding="utf-8"))
     arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("density", "velocity")}
-    return Plume(scene=plume(told["seed"]), origin=tuple(told["origin"]), **arrays)
+    size = told.get("voxel_size", VOXEL_SIZE)
+    return Plume(scene=plume(told["seed"]), origin=tuple(told["origin"]), voxel_size=size, **arrays)
 
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", default="0:150", help="A:B")
+    parser.add_argument("--voxel-size", type=float, default=VOXEL_SIZE, help="m")
     given = parser.parse_args(arguments)
     first, stop = map(int, given.seeds.split(":"))
     progress = Progress(label="simulate plumes", total=stop - first)
     for seed in range(first, stop):
-        simulate(seed, given.out / f"{seed:04d}")
+        simulate(seed, given.out / f"{seed:04d}", voxel_size=given.voxel_size)
         progress.step()
     return 0
 

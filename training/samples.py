@@ -17,7 +17,7 @@ from backend.geometry.lattice import Lattice
 from backend.prior.predict import SHAPE
 from backend.prior.window import Stand, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
-from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
+from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 
 _WHOLE = 0.65  # of the lessons: their pictures show all of the smoke, and the grid holds it
 LEAST, MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
@@ -122,13 +122,13 @@ def smoke_of(plume: Plume, first: int, num_frames: int) -> Smoke:
         speeds.append(np.sqrt(0.5 * (x * x + y * y) + z * z)[density > 0])
         weights.append(density[density > 0])
     if not mass.any():
-        top = VOXEL_SIZE * plume.density.shape[3]
+        top = plume.voxel_size * plume.density.shape[3]
         return Smoke(middle=np.zeros(2), bottom=0.0, top=top, cell=top / CELLS_HIGH, speed=0.0)
     level, speed, weight = (np.concatenate(parts) for parts in (levels, speeds, weights))
-    bottom, top = (plume.origin[2] + VOXEL_SIZE * edge for edge in (level.min() - 0.5, level.max() + 0.5))
-    wide = VOXEL_SIZE * float(np.quantile(widths, 0.9))
+    bottom, top = (plume.origin[2] + plume.voxel_size * edge for edge in (level.min() - 0.5, level.max() + 0.5))
+    wide = plume.voxel_size * float(np.quantile(widths, 0.9))
     return Smoke(
-        middle=np.asarray(plume.origin[:2]) + VOXEL_SIZE * np.array(ndimage.center_of_mass(mass)),
+        middle=np.asarray(plume.origin[:2]) + plume.voxel_size * np.array(ndimage.center_of_mass(mass)),
         bottom=float(bottom),
         top=float(top),
         cell=float(max((top - bottom) / CELLS_HIGH, wide / CELLS_WIDE)),
@@ -149,12 +149,12 @@ def stride_for(smoke: Smoke, draw: np.random.Generator, *, cell: float, num_fram
 
 def lattice_of(plume: Plume) -> Lattice:
     """Where its voxels lie."""
-    return Lattice(origin=plume.origin, voxel_size=VOXEL_SIZE, shape=plume.density.shape[1:])  # type: ignore[arg-type]
+    return Lattice(origin=plume.origin, voxel_size=plume.voxel_size, shape=plume.density.shape[1:])  # type: ignore[arg-type]
 
 
 def truth(plume: Plume, moment: int, stand: Stand) -> tuple[np.ndarray, np.ndarray]:
     """Density [X, Y, Z] 1/m and velocity [X, Y, Z, 3] m/s of a plume on the grid, along its axes."""
-    at = np.moveaxis((stand.centres() - plume.origin) / VOXEL_SIZE, -1, 0)
+    at = np.moveaxis((stand.centres() - plume.origin) / plume.voxel_size, -1, 0)
     density, velocity = plume.density_at(moment), plume.velocity_at(moment)
     found = [ndimage.map_coordinates(velocity[..., axis], at, order=1, mode="nearest") for axis in range(3)]
     return (
