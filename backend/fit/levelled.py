@@ -17,7 +17,7 @@ from backend.prior.predict import Proposal, one_thread
 from backend.prior.sheets import UNIT, look_at_sheets, moments_around, parts
 from backend.prior.window import Stand
 
-OWN_ERROR = 1.5  # voxels that the middle of a proposal's level is taken to be off; tuned on ten plumes that were held back
+OWN_ERROR = 2.0  # voxels that the middle of a proposal's level is taken to be off; tuned on ten held-back plumes and three scenes
 _SMOOTH = 1.5  # voxels of height, standard deviation: neighbouring levels move alike
 _FAINT = 0.01  # of the fullest level: one with less does not move of itself
 
