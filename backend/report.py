@@ -18,7 +18,7 @@ from backend.io.frame_stack import FrameStack
 from backend.io.job_folder import JobFolder
 from backend.io.particles import read_particles
 from backend.io.records import open_stage_file
-from backend.render.picture import picture
+from backend.render.picture import picture_of
 
 TILE_HEIGHT = 300  # px
 COLUMNS = ("video", "smoke layer", "reconstruction", "from the side")
@@ -44,8 +44,8 @@ def draw_report(job: Path, path: Path) -> None:
             tiles = [
                 video[..., :3] * video[..., 3:],
                 layers[index][..., :3],
-                picture(particle_frame, view)[..., :3],
-                picture(particle_frame, orbit(view, pivot, 90.0))[..., :3],
+                picture_of(particles, particle_frame, index, view)[..., :3],
+                picture_of(particles, particle_frame, index, orbit(view, pivot, 90.0))[..., :3],
             ]
             rows.append(np.hstack([_tile(tile) for tile in tiles]))
     sheet = images.encode_srgb(np.vstack(rows))

@@ -43,6 +43,8 @@ def apply(smoke: bpy.types.Object, result: Result, *, name: str) -> bpy.types.Ma
     node.node_tree = smoke_group()
     node.name = node.label = GROUP_NAME
     node.width = 220
+    if result.light is not None and result.light.anisotropy > 0.0:  # 0: the clip does not tell
+        node.inputs["Anisotropy"].default_value = result.light.anisotropy
     output = made.node_tree.nodes.new("ShaderNodeOutputMaterial")
     output.location = (300, 0)
     made.node_tree.links.new(node.outputs["Volume"], output.inputs["Volume"])

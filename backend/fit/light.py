@@ -1,10 +1,11 @@
 """The clip's light from the shading of its smoke: where the sun stands, how bright it is, and what else there is.
 
-Thin smoke shows L = S exp(-s d(x)) + A a(x): d is the optical depth between x and the sun, s < 1 because light scattered
-forwards goes on (similarity: s = 1 - g, van de Hulst 1980), a the mean of the same over the sky. A pixel shows the mean of L
-along its ray, each place as it is seen through what is before it. S and A are a non-negative least squares (Lawson and Hanson
-1974) for each direction of the sun that is tried; the direction that explains most stays. All of it is done on a few small
-pictures, and what counts is what it explains of others.
+Thin smoke shows L = S p exp(-s d(x)) + A a(x): d is the optical depth between x and the sun, s < 1 because light scattered
+forwards goes on (similarity: s = 1 - g, van de Hulst 1980), a the mean of the same over the sky. p is the phase function
+(backend/render/scattering.py) of the angle by which sunlight is turned to get to the camera: while that goes around the smoke,
+all of it becomes brighter or darker. A pixel shows the mean of L along its ray, each place as it is seen through what is before
+it. S and A are a non-negative least squares (Lawson and Hanson 1974) for each direction of the sun and each p that is tried;
+those that explain most stay. All of it is done on a few small pictures, and what counts is what it explains of others.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ from backend.field.shadow import depth_towards
 from backend.geometry.camera import View, resized
 from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame
+from backend.render.scattering import phase
 from backend.render.voxelize import voxelize
 
 LEAST_EXPLAINED = 0.3  # of the colour's variation, on other frames: less is no shading
 LEAST_VARIATION = 0.05  # of the mean brightness: smoke of one brightness shows no light
 SOFTNESS = (0.35, 0.7, 1.0)
+ANISOTROPY = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
+USUAL_ANISOTROPY = 0.25  # how large it is taken to be before anything is seen, root of the mean square
+UNEVEN = 0.1  # of the brightness of a frame, that comes of other things
 NUM_FRAMES = 8
 _SIDE = 44  # px
 _CELLS = 26  # of the longest side
@@ -48,10 +53,11 @@ class Shot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rays:
-    """Of one shot. colors [P, 3]; places [3, P, S] voxels of the lattice; weights [P, S], one in sum along each ray."""
+    """Of one shot. ahead [3]: from the camera to the smoke, of length 1; colors [P, 3]; places [3, P, S] voxels of the lattice; weights [P, S], one in sum along each ray."""
 
     density: np.ndarray
     lattice: Lattice
+    ahead: np.ndarray
     colors: np.ndarray
     places: np.ndarray
     weights: np.ndarray
@@ -75,12 +81,15 @@ def find_light(shots: Sequence[Shot]) -> Light | None:
     softness = SOFTNESS[int(np.argmin([taught.error(direction, one) for one in SOFTNESS]))]
     for degrees in _NEAR:
         direction = taught.closer(direction, degrees, softness)
-    weights, least = _solved(taught.columns(direction, softness), taught.brightness)
-    missed = np.square(proof.brightness - proof.columns(direction, softness) @ weights).sum()
+    anisotropy = whole.anisotropy(direction, softness)
+    weights, least = _solved(taught.columns(direction, softness, anisotropy), taught.brightness)
+    missed = np.square(proof.brightness - proof.columns(direction, softness, anisotropy) @ weights).sum()
     explained = 1.0 - float(missed / np.square(proof.brightness - taught.brightness.mean()).sum())
     if not explained >= LEAST_EXPLAINED:
         return None
-    parts = np.array([_solved(whole.columns(direction, softness), whole.colors[:, channel])[0] for channel in range(3)])
+    columns = whole.columns(direction, softness, anisotropy)
+    parts = np.array([_solved(columns, whole.colors[:, channel])[0] for channel in range(3)])
+    even = whole.columns(direction, softness, 0.0).mean(axis=0) * parts.mean(axis=0)
     variation = float(np.square(taught.brightness - taught.brightness.mean()).sum())
     as_good = np.vstack([direction, tried[errors <= least + _AS_GOOD * (variation - least)]])
     angles = np.degrees(np.arccos(np.clip(as_good @ direction, -1.0, 1.0)))
@@ -91,6 +100,8 @@ def find_light(shots: Sequence[Shot]) -> Light | None:
         softness=softness,
         explained=explained,
         doubt_degrees=float(np.sqrt(np.square(angles).mean())),
+        anisotropy=anisotropy,
+        sun_share=float(even[0] / even.sum()),
     )
 
 
@@ -114,12 +125,32 @@ class _Search:
         return tried[int(np.argmin([self.error(way, softness) for way in tried]))]
 
     def error(self, direction: np.ndarray, softness: float) -> float:
-        return _solved(self.columns(direction, softness), self.brightness)[1]
+        """Of the best anisotropy."""
+        return min(self._errors(direction, softness))
 
-    def columns(self, direction: np.ndarray, softness: float) -> np.ndarray:
+    def anisotropy(self, direction: np.ndarray, softness: float) -> float:
+        """The best one, as far as the camera's way tells: of one that hardly turns, brightness tells of other things."""
+        best = ANISOTROPY[int(np.argmin(self._errors(direction, softness)))]
+        cosines = np.array([item.ahead @ direction for item in self.rays])
+        told = np.square(3.0 * (cosines - cosines.mean())).sum() / UNEVEN**2  # p is about 1 + 3 g cos
+        return float(best * told / (told + 1.0 / USUAL_ANISOTROPY**2))
+
+    def columns(self, direction: np.ndarray, softness: float, anisotropy: float) -> np.ndarray:
         """[P, 2]: what the rays show of a sun and of a sky of brightness one."""
-        sun = self._shown(lambda item: np.exp(-softness * depth_towards(item.density, item.lattice, direction)))
-        return np.stack([sun, self._sky[softness]], axis=1)
+        return np.stack([self._sun(direction, softness) * self._phase(direction, anisotropy), self._sky[softness]], axis=1)
+
+    def _errors(self, direction: np.ndarray, softness: float) -> list[float]:
+        sun, sky = self._sun(direction, softness), self._sky[softness]
+        columns = (np.stack([sun * self._phase(direction, one), sky], axis=1) for one in ANISOTROPY)
+        return [_solved(each, self.brightness)[1] for each in columns]
+
+    def _sun(self, direction: np.ndarray, softness: float) -> np.ndarray:
+        return self._shown(lambda item: np.exp(-softness * depth_towards(item.density, item.lattice, direction)))
+
+    def _phase(self, direction: np.ndarray, anisotropy: float) -> np.ndarray:
+        """[P]: by which sunlight goes on to the cameras."""
+        values = phase(anisotropy, np.array([item.ahead @ direction for item in self.rays]))
+        return np.repeat(values, [len(item.colors) for item in self.rays])
 
     def _shown(self, light: Callable[[_Rays], np.ndarray]) -> np.ndarray:
         return np.concatenate([item.shown(light(item)) for item in self.rays])
@@ -175,11 +206,13 @@ def _rays(shot: Shot) -> _Rays | None:
     total = weights.sum(axis=1)
     is_met = total > 0.5 * _OPAQUE
     seen = small[rows, columns]
+    ahead = np.average(shot.particles.positions, axis=0, weights=shot.particles.optical_masses) - view.position
     if is_met.sum() < 8:
         return None
     return _Rays(
         density=density,
         lattice=lattice,
+        ahead=ahead / np.linalg.norm(ahead),
         colors=(seen[:, :3] / seen[:, 3:])[is_met].astype(np.float64),
         places=places[:, is_met],
         weights=weights[is_met] / total[is_met, None],

@@ -14,6 +14,7 @@ from backend.io.particles import ParticleFrame, Particles
 from backend.render import splat as renderer
 from backend.render.composite import composite
 from backend.render.gaussians import Gaussians, isotropic
+from backend.render.scattering import seen_from
 from backend.reporting import Report
 
 
@@ -35,6 +36,13 @@ def picture(frame: ParticleFrame, view: View) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate([np.moveaxis(color, 0, -1), opacity[..., None]], axis=2))
 
 
+def picture_of(particles: Particles, frame: ParticleFrame, index: int, view: View) -> np.ndarray:
+    """picture of frame `index` of an asset, lit as the view sees it; nobody filmed a forecast one: its colours are the last
+    camera's."""
+    filmed = view_at(particles.info.cameras, min(index, particles.num_frames - 1))
+    return picture(seen_from(frame, view, filmed=filmed, light=particles.info.light), view)
+
+
 def render_frames(
     particles: Particles,
     cameras: Cameras,
@@ -47,7 +55,8 @@ def render_frames(
     """Write %04d.png, named by video frame number from 0."""
     for step, (frame, camera) in enumerate(wanted):
         report.progress(step, len(wanted))
-        image = picture(particles.frame(frame - frame_start), view_at(cameras, camera))
+        index = frame - frame_start
+        image = picture_of(particles, particles.frame(index), index, view_at(cameras, camera))
         with whole_file(folder / f"{frame:04d}.png") as part:
             images.write_png(part, image)
     report.progress(len(wanted), len(wanted))

@@ -9,7 +9,7 @@ import numpy as np
 from backend.geometry.camera import View
 from backend.io.particles import ParticleFrame, Particles
 from backend.physics.divergence import both_divergences
-from backend.render.picture import picture
+from backend.render.picture import picture_of
 from backend.render.voxelize import voxelize
 from backend.reporting import Report, SilentReport
 from backend.score.truth_set import Volume
@@ -25,7 +25,7 @@ class ParticlePrediction:
         self.num_frames = self._start + particles.num_frames + particles.num_forecast
 
     def picture(self, view: View, frame: int) -> np.ndarray:
-        return picture(self._at(frame), view)
+        return picture_of(self._particles, self._at(frame), frame - self._start, view)
 
     def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
         grids = voxelize(self._at(frame), like.lattice)

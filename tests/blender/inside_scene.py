@@ -299,6 +299,7 @@ def check_the_sun_stands_where_the_clip_s_did(folder: Path) -> None:
     """A sun shines along its -z. The light keeps the hue of faintly coloured smoke; strongly coloured smoke keeps its own."""
     towards, sun_light, sky = (-0.6, 0.48, 0.64), (0.6, 0.54, 0.48), (0.1, 0.12, 0.15)
     light = {"direction": towards, "sun": sun_light, "ambient": sky, "softness": 0.7, "explained": 0.8, "doubt_degrees": 9.0}
+    light |= {"anisotropy": 0.2, "sun_share": 0.9}
     for name, color, hue in (("grey", (0.4, 0.36, 0.32), (1.0, 1.0, 1.0)), ("orange", (0.8, 0.4, 0.2), (1.0, 0.5, 0.25))):
         job = Path(shutil.copytree(JOB, folder / name))
         change_result(job, light=light, smoke_color=color)
@@ -316,3 +317,4 @@ def check_the_sun_stands_where_the_clip_s_did(folder: Path) -> None:
         assert np.allclose(world[:3], 0.7 * np.array(sky) / hue, atol=1e-5), name
         albedo = smoke_node(smoke).inputs["Albedo"].default_value
         assert np.allclose(np.array(albedo[:3]) / max(albedo[:3]), hue, atol=1e-5), name
+        assert np.isclose(smoke_node(smoke).inputs["Anisotropy"].default_value, 0.2), name
