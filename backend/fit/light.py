@@ -4,8 +4,9 @@ Thin smoke shows L = S p exp(-s d(x)) + A a(x): d is the optical depth between x
 forwards goes on (similarity: s = 1 - g, van de Hulst 1980), a the mean of the same over the sky. p is the phase function
 (backend/render/scattering.py) of the angle by which sunlight is turned to get to the camera: while that goes around the smoke,
 all of it becomes brighter or darker. A pixel shows the mean of L along its ray, each place as it is seen through what is before
-it. S and A are a non-negative least squares (Lawson and Hanson 1974) for each direction of the sun and each p that is tried;
-those that explain most stay. All of it is done on a few small pictures, and what counts is what it explains of others.
+it. S and A are a non-negative least squares (Lawson and Hanson 1974). The direction of the sun is the one that explains most of
+the shading within each picture, for smoke becomes brighter for other reasons, too; then p is the most likely one of all pictures
+together. All of it is done on a few small ones, and what counts is what it explains of others.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from backend.render.voxelize import voxelize
 LEAST_EXPLAINED = 0.3  # of the colour's variation, on other frames: less is no shading
 LEAST_VARIATION = 0.05  # of the mean brightness: smoke of one brightness shows no light
 SOFTNESS = (0.35, 0.7, 1.0)
-ANISOTROPY = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
-USUAL_ANISOTROPY = 0.25  # how large it is taken to be before anything is seen, root of the mean square
-UNEVEN = 0.1  # of the brightness of a frame, that comes of other things
+ANISOTROPY = tuple(0.05 * step for step in range(13))
+USUAL_ANISOTROPY, OTHERS = 0.25, 0.1  # what it is taken to be before anything is seen, and the standard deviation of that
+SIGHTS = 20.0  # as many observations that are independent of each other are in the pictures
 NUM_FRAMES = 8
 _SIDE = 44  # px
 _CELLS = 26  # of the longest side
@@ -53,7 +54,8 @@ class Shot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rays:
-    """Of one shot. ahead [3]: from the camera to the smoke, of length 1; colors [P, 3]; places [3, P, S] voxels of the lattice; weights [P, S], one in sum along each ray."""
+    """Of one shot. ahead [3]: from the camera to the smoke, of length 1; colors [P, 3]; places [3, P, S] voxels of the lattice;
+    weights [P, S], one in sum along each ray."""
 
     density: np.ndarray
     lattice: Lattice
@@ -82,7 +84,7 @@ def find_light(shots: Sequence[Shot]) -> Light | None:
     for degrees in _NEAR:
         direction = taught.closer(direction, degrees, softness)
     anisotropy = whole.anisotropy(direction, softness)
-    weights, least = _solved(taught.columns(direction, softness, anisotropy), taught.brightness)
+    weights, _ = _solved(taught.columns(direction, softness, anisotropy), taught.brightness)
     missed = np.square(proof.brightness - proof.columns(direction, softness, anisotropy) @ weights).sum()
     explained = 1.0 - float(missed / np.square(proof.brightness - taught.brightness.mean()).sum())
     if not explained >= LEAST_EXPLAINED:
@@ -90,8 +92,8 @@ def find_light(shots: Sequence[Shot]) -> Light | None:
     columns = whole.columns(direction, softness, anisotropy)
     parts = np.array([_solved(columns, whole.colors[:, channel])[0] for channel in range(3)])
     even = whole.columns(direction, softness, 0.0).mean(axis=0) * parts.mean(axis=0)
-    variation = float(np.square(taught.brightness - taught.brightness.mean()).sum())
-    as_good = np.vstack([direction, tried[errors <= least + _AS_GOOD * (variation - least)]])
+    least = taught.error(direction, softness)
+    as_good = np.vstack([direction, tried[errors <= least + _AS_GOOD * (taught.variation - least)]])
     angles = np.degrees(np.arccos(np.clip(as_good @ direction, -1.0, 1.0)))
     return Light(
         direction=_triple(direction),
@@ -125,24 +127,29 @@ class _Search:
         return tried[int(np.argmin([self.error(way, softness) for way in tried]))]
 
     def error(self, direction: np.ndarray, softness: float) -> float:
-        """Of the best anisotropy."""
-        return min(self._errors(direction, softness))
+        """Of the shading within each picture, each with a sun and a sky of its own brightness."""
+        parts = zip(self._by_shot(self.columns(direction, softness, 0.0)), self._by_shot(self.brightness), strict=True)
+        return sum(_solved(*part)[1] for part in parts)
+
+    @property
+    def variation(self) -> float:
+        """Squares of the brightness within each picture, about its mean."""
+        return sum(float(np.square(part - part.mean()).sum()) for part in self._by_shot(self.brightness))
+
+    def _by_shot(self, values: np.ndarray) -> list[np.ndarray]:
+        return np.split(values, np.cumsum([len(item.colors) for item in self.rays])[:-1])
 
     def anisotropy(self, direction: np.ndarray, softness: float) -> float:
-        """The best one, as far as the camera's way tells: of one that hardly turns, brightness tells of other things."""
-        best = ANISOTROPY[int(np.argmin(self._errors(direction, softness)))]
-        cosines = np.array([item.ahead @ direction for item in self.rays])
-        told = np.square(3.0 * (cosines - cosines.mean())).sum() / UNEVEN**2  # p is about 1 + 3 g cos
-        return float(best * told / (told + 1.0 / USUAL_ANISOTROPY**2))
+        """The most likely one. Of a camera that hardly turns all explain the same, and the usual one stays."""
+        sun, sky = self._sun(direction, softness), self._sky[softness]
+        columns = [np.stack([sun * self._phase(direction, one), sky], axis=1) for one in ANISOTROPY]
+        errors = np.array([_solved(each, self.brightness)[1] for each in columns])
+        unusual = (np.array(ANISOTROPY) - USUAL_ANISOTROPY) / OTHERS
+        return ANISOTROPY[int(np.argmin(SIGHTS * errors / max(float(errors.min()), 1e-30) + unusual * unusual))]
 
     def columns(self, direction: np.ndarray, softness: float, anisotropy: float) -> np.ndarray:
         """[P, 2]: what the rays show of a sun and of a sky of brightness one."""
         return np.stack([self._sun(direction, softness) * self._phase(direction, anisotropy), self._sky[softness]], axis=1)
-
-    def _errors(self, direction: np.ndarray, softness: float) -> list[float]:
-        sun, sky = self._sun(direction, softness), self._sky[softness]
-        columns = (np.stack([sun * self._phase(direction, one), sky], axis=1) for one in ANISOTROPY)
-        return [_solved(each, self.brightness)[1] for each in columns]
 
     def _sun(self, direction: np.ndarray, softness: float) -> np.ndarray:
         return self._shown(lambda item: np.exp(-softness * depth_towards(item.density, item.lattice, direction)))

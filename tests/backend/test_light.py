@@ -10,7 +10,7 @@ import pytest
 from backend.contract.light import Light, parse_light
 from backend.field.rays import optical_depth
 from backend.field.shadow import depth_towards
-from backend.fit.light import Shot, evenly, find_light
+from backend.fit.light import USUAL_ANISOTROPY, Shot, evenly, find_light
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame
@@ -43,7 +43,7 @@ def camera(degrees: float) -> View:
     return View(width=48, height=72, fx=110.0, fy=110.0, cx=24.0, cy=36.0, camera_to_world=matrix)
 
 
-def shot(seed: int, direction: np.ndarray | None, degrees: float) -> Shot:
+def shot(seed: int, direction: np.ndarray | None, degrees: float, *, anisotropy: float = USUAL_ANISOTROPY) -> Shot:
     """A frame as a sun and an even sky show it; None: smoke of one colour. Each pixel shows what its ray gathers, near smoke
     before far smoke, on slabs of the lattice: not the way in which the fit does it."""
     particles, view = smoke(seed), camera(degrees)
@@ -52,7 +52,8 @@ def shot(seed: int, direction: np.ndarray | None, degrees: float) -> Shot:
         light = np.full((*density.shape, 3), 0.4)
     else:
         reached = np.mean([np.exp(-0.7 * depth_towards(density, LATTICE, way)) for way in evenly(40) if way[2] > 0], axis=0)
-        light = np.exp(-0.7 * depth_towards(density, LATTICE, direction))[..., None] * SUN + reached[..., None] * SKY
+        sun = SUN * (1 - anisotropy**2) / (1 + anisotropy**2 + 2 * anisotropy * direction @ view.position / 12.0) ** 1.5
+        light = np.exp(-0.7 * depth_towards(density, LATTICE, direction))[..., None] * sun + reached[..., None] * SKY
     before = np.exp(-depth_towards(density, LATTICE, view.position / np.linalg.norm(view.position)))
     emitted = [optical_depth(np.ascontiguousarray(density * before * light[..., c], np.float32), LATTICE, view) for c in range(3)]
     gathered = optical_depth(np.ascontiguousarray(density * before, np.float32), LATTICE, view)
@@ -72,6 +73,23 @@ def test_the_sun_is_found_where_it_stands(azimuth: float, elevation: float) -> N
     assert found.doubt_degrees < 25.0
     np.testing.assert_allclose(found.sun, SUN, rtol=0.15)
     assert found.ambient[2] > found.ambient[0]  # the sky's hue is not the sun's
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.25, 0.5])
+def test_how_far_light_goes_on_is_told_by_a_camera_that_goes_around(anisotropy: float) -> None:
+    direction = np.array([-0.6, 0.64, 0.48])
+    found = find_light([shot(seed, direction, 25.0 * seed, anisotropy=anisotropy) for seed in range(6)])
+    assert found is not None
+    assert abs(found.anisotropy - anisotropy) < 0.1, found.anisotropy
+    assert 0.6 < found.sun_share < 1.0
+
+
+def test_a_still_camera_tells_nothing_of_it() -> None:
+    direction = np.array([-0.6, 0.64, 0.48])
+    for anisotropy in (0.0, 0.5):
+        found = find_light([shot(seed, direction, 0.0, anisotropy=anisotropy) for seed in range(4)])
+        assert found is not None
+        assert found.anisotropy == pytest.approx(USUAL_ANISOTROPY, abs=0.06)
 
 
 def test_smoke_of_one_colour_shows_no_light() -> None:
@@ -98,16 +116,21 @@ def test_too_little_to_tell() -> None:
 
 def test_a_light_survives_its_own_text() -> None:
     light = Light(
-        direction=(0.6, 0.0, 0.8), sun=(1.0, 0.9, 0.8), ambient=(0.0, 0.1, 0.2), softness=0.7, explained=0.8, doubt_degrees=9.0
-    )
+        direction=(0.6, 0.0, 0.8), sun=(1.0, 0.9, 0.8), ambient=(0.0, 0.1, 0.2), softness=0.7, explained=0.8, doubt_degrees=9.0,
+        anisotropy=0.2, sun_share=0.9,
+    )  # fmt: skip
     assert parse_light(asdict(light)) == light
     for name, value in (
         ("direction", (0.0, 0.0, 0.0)),
         ("sun", (-1.0, 0.0, 0.0)),
         ("ambient", (1.0,)),
         ("softness", float("nan")),
+        ("anisotropy", 1.0),
+        ("sun_share", 1.1),
     ):
         with pytest.raises(ValueError):
             parse_light({**asdict(light), name: value})
+    older = {name: value for name, value in asdict(light).items() if name not in ("anisotropy", "sun_share")}
+    assert parse_light(older) == replace(light, anisotropy=0.0, sun_share=0.0), "files of before these were found"
     with pytest.raises(KeyError):
         parse_light({})
