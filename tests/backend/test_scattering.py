@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from backend.contract.cameras import Cameras
 from backend.contract.light import Light
-from backend.geometry.camera import View
+from backend.geometry.camera import View, view_at
 from backend.io.particles import ParticleFrame
+from backend.render.picture import picture, picture_of
 from backend.render.scattering import ONCE, phase, seen_from
 
 SUN = Light(
@@ -74,3 +77,23 @@ def test_a_particle_in_the_camera_s_own_place_and_none_at_all_stay_finite() -> N
     there = seen_from(frame(np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])), **views, light=replace(SUN, anisotropy=0.99))
     assert np.isfinite(there.colors).all() and (there.colors > 0).all()
     assert seen_from(frame(np.zeros((0, 3))), **views, light=SUN).count == 0
+
+
+def test_pictures_of_an_asset_are_lit_for_their_view_by_the_camera_of_their_frame() -> None:
+    """The clip's own pictures are the particles' own; a forecast, which nobody filmed, has the last camera's colours."""
+    smoke = frame(np.random.default_rng(1).normal(0.0, 0.3, (40, 3)))
+    matrices = []
+    for way in ((1.0, 0.0), (0.0, 1.0)):  # looks into the sun, then across its light
+        away = np.array([*way, 0.0])
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.stack([np.cross(away, [0.0, 0.0, 1.0]), [0.0, 0.0, -1.0], away], axis=1)
+        matrix[:3, 3] = -4.0 * away
+        matrices.append(matrix.tolist())
+    cameras = Cameras(width=40, height=30, fx=50.0, fy=50.0, cx=20.0, cy=15.0, fps=24.0, camera_to_world=matrices)
+    asset = SimpleNamespace(info=SimpleNamespace(cameras=cameras, light=SUN), num_frames=2)
+    first, last = (view_at(cameras, index) for index in (0, 1))
+    for index, own in ((0, first), (1, last), (2, last), (7, last)):
+        np.testing.assert_array_equal(picture_of(asset, smoke, index, own), picture(smoke, own))  # type: ignore[arg-type]
+    lit, as_filmed = picture_of(asset, smoke, 1, first), picture(smoke, first)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(lit[..., 3], as_filmed[..., 3])
+    assert lit[..., 0].sum() > 1.2 * as_filmed[..., 0].sum(), "before the sun smoke is brighter"
