@@ -11,8 +11,9 @@ together. All of it is done on a few small ones, and what counts is what it expl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -52,7 +53,7 @@ class Shot:
     layer: np.ndarray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class _Rays:
     """Of one shot. ahead [3]: from the camera to the smoke, of length 1; colors [P, 3]; places [3, P, S] voxels of the lattice;
     weights [P, S], one in sum along each ray."""
@@ -63,6 +64,13 @@ class _Rays:
     colors: np.ndarray
     places: np.ndarray
     weights: np.ndarray
+
+    @cached_property
+    def sky(self) -> dict[float, np.ndarray]:
+        """Of each softness [P]: what the rays show of an even sky of brightness one."""
+        ways = evenly(26)
+        depths = [depth_towards(self.density, self.lattice, way) for way in ways[ways[:, 2] > 0]]
+        return {softness: self.shown(np.mean([np.exp(-softness * depth) for depth in depths], axis=0)) for softness in SOFTNESS}
 
     def shown(self, light: np.ndarray) -> np.ndarray:
         """[P]: what the rays show of a light [X, Y, Z] on the lattice."""
@@ -114,7 +122,7 @@ class _Search:
         self.rays = rays
         self.colors = np.concatenate([item.colors for item in rays])
         self.brightness = self.colors.mean(axis=1)
-        self._sky = {softness: self._shown(lambda item, s=softness: _sky_light(item, s)) for softness in SOFTNESS}
+        self._sky = {softness: np.concatenate([item.sky[softness] for item in rays]) for softness in SOFTNESS}
 
     def closer(self, direction: np.ndarray, degrees: float, softness: float) -> np.ndarray:
         """The best of a direction and of six around it."""
@@ -152,15 +160,13 @@ class _Search:
         return np.stack([self._sun(direction, softness) * self._phase(direction, anisotropy), self._sky[softness]], axis=1)
 
     def _sun(self, direction: np.ndarray, softness: float) -> np.ndarray:
-        return self._shown(lambda item: np.exp(-softness * depth_towards(item.density, item.lattice, direction)))
+        shadows = (np.exp(-softness * depth_towards(item.density, item.lattice, direction)) for item in self.rays)
+        return np.concatenate([item.shown(shadow) for item, shadow in zip(self.rays, shadows, strict=True)])
 
     def _phase(self, direction: np.ndarray, anisotropy: float) -> np.ndarray:
         """[P]: by which sunlight goes on to the cameras."""
         values = phase(anisotropy, np.array([item.ahead @ direction for item in self.rays]))
         return np.repeat(values, [len(item.colors) for item in self.rays])
-
-    def _shown(self, light: Callable[[_Rays], np.ndarray]) -> np.ndarray:
-        return np.concatenate([item.shown(light(item)) for item in self.rays])
 
 
 def evenly(count: int) -> np.ndarray:
@@ -169,12 +175,6 @@ def evenly(count: int) -> np.ndarray:
     height, angle = 1.0 - 2.0 * index / count, np.pi * (1.0 + 5.0**0.5) * index
     radius = np.sqrt(1.0 - height * height)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
-
-
-def _sky_light(item: _Rays, softness: float) -> np.ndarray:
-    """[X, Y, Z]: share of an even sky that reaches each voxel."""
-    sky = evenly(26)
-    return np.mean([np.exp(-softness * depth_towards(item.density, item.lattice, way)) for way in sky[sky[:, 2] > 0]], axis=0)
 
 
 def _solved(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
