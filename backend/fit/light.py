@@ -91,12 +91,13 @@ def find_light(shots: Sequence[Shot]) -> Light | None:
     softness = SOFTNESS[int(np.argmin([taught.error(direction, one) for one in SOFTNESS]))]
     for degrees in _NEAR:
         direction = taught.closer(direction, degrees, softness)
-    anisotropy = whole.anisotropy(direction, softness)
-    weights, _ = _solved(taught.columns(direction, softness, anisotropy), taught.brightness)
-    missed = np.square(proof.brightness - proof.columns(direction, softness, anisotropy) @ weights).sum()
+    learned = taught.anisotropy(direction, softness)
+    weights, _ = _solved(taught.columns(direction, softness, learned), taught.brightness)
+    missed = np.square(proof.brightness - proof.columns(direction, softness, learned) @ weights).sum()
     explained = 1.0 - float(missed / np.square(proof.brightness - taught.brightness.mean()).sum())
     if not explained >= LEAST_EXPLAINED:
         return None
+    anisotropy = whole.anisotropy(direction, softness)
     columns = whole.columns(direction, softness, anisotropy)
     parts = np.array([_solved(columns, whole.colors[:, channel])[0] for channel in range(3)])
     even = whole.columns(direction, softness, 0.0).mean(axis=0) * parts.mean(axis=0)
@@ -213,13 +214,13 @@ def _rays(shot: Shot) -> _Rays | None:
     total = weights.sum(axis=1)
     is_met = total > 0.5 * _OPAQUE
     seen = small[rows, columns]
-    ahead = np.average(shot.particles.positions, axis=0, weights=shot.particles.optical_masses) - view.position
     if is_met.sum() < 8:
         return None
+    ahead = np.average(shot.particles.positions, axis=0, weights=shot.particles.optical_masses) - view.position
     return _Rays(
         density=density,
         lattice=lattice,
-        ahead=ahead / np.linalg.norm(ahead),
+        ahead=ahead / max(float(np.linalg.norm(ahead)), 1e-300),
         colors=(seen[:, :3] / seen[:, 3:])[is_met].astype(np.float64),
         places=places[:, is_met],
         weights=weights[is_met] / total[is_met, None],
