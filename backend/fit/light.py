@@ -32,7 +32,8 @@ LEAST_EXPLAINED = 0.3  # of the colour's variation, on other frames: less is no 
 LEAST_VARIATION = 0.05  # of the mean brightness: smoke of one brightness shows no light
 SOFTNESS = (0.35, 0.7, 1.0)
 ANISOTROPY = tuple(0.05 * step for step in range(13))
-USUAL_ANISOTROPY, OTHERS = 0.25, 0.1  # what it is taken to be before anything is seen, and the standard deviation of that
+USUAL_ANISOTROPY, OTHERS = 0.25, 0.1  # what it is taken to be before anything is seen, and the standard deviation of that. The
+# benchmark's smoke scatters so, too: where its cameras go around it, they tell the same without this (docs/method.md)
 SIGHTS = 20.0  # as many observations that are independent of each other are in the pictures
 NUM_FRAMES = 8
 _SIDE = 44  # px
