@@ -13,6 +13,7 @@ from backend.io.atomic import whole_file
 from backend.io.particles import ParticleFrame, Particles
 from backend.render import splat as renderer
 from backend.render.composite import composite
+from backend.render.evening import evened
 from backend.render.gaussians import Gaussians, isotropic
 from backend.render.scattering import seen_from
 from backend.reporting import Report
@@ -37,10 +38,11 @@ def picture(frame: ParticleFrame, view: View) -> np.ndarray:
 
 
 def picture_of(particles: Particles, frame: ParticleFrame, index: int, view: View) -> np.ndarray:
-    """picture of frame `index` of an asset, lit as the view sees it; nobody filmed a forecast one: its colours are the last
-    camera's."""
+    """picture of frame `index` of an asset, as bright as the view sees it and as even as it knows it; nobody filmed a forecast
+    one: its colours are the last camera's."""
     filmed = view_at(particles.info.cameras, min(index, particles.num_frames - 1))
-    return picture(seen_from(frame, view, filmed=filmed, light=particles.info.light), view)
+    lit = seen_from(frame, view, filmed=filmed, light=particles.info.light)
+    return picture(evened(lit, view, filmed=filmed), view)
 
 
 def render_frames(
