@@ -7,6 +7,7 @@ better than a fluid under pressure and buoyancy, for what those do to a field th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ import numpy as np
 from backend.contract.job import ForecastConfig
 from backend.fit.carry import as_fluid
 from backend.fit.guide import Guide
+from backend.fit.ray_motion import Shot, followed
+from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
 from backend.physics.interpolate import interpolate_velocity
@@ -57,19 +60,29 @@ def trust_of(record: VisualRecord, config: ForecastConfig) -> Trust:
     return Trust(speed=speed, rate=config.fading * speed / size if size > 0.0 else 0.0, spreading=config.spreading)
 
 
+def recent_guides(volumes: Series[VolumeRecord], layers: Series[np.ndarray], scene: Scene) -> list[Guide]:
+    """The last frames' volumes, with the motion that the pictures show of each ray; layers: [H, W, 4] of all frames."""
+    last, guides = len(layers) - 1, []
+    for frame in range(max(0, len(layers) - RECENT), len(layers)):
+        guide, beside = Guide(volumes[frame]), range(max(0, frame - 1), min(last, frame + 1) + 1)
+        if len(beside) > 1:
+            shots = [Shot(depth=optical_depth(layers[number]), view=scene.views[number]) for number in beside]
+            guide.velocity = followed(guide, shots, beside.index(frame), seconds=scene.seconds_per_frame)
+        guides.append(guide)
+    return guides
+
+
 def recent_velocity(
     points: np.ndarray,  # [N, 3] m
     fluid: Series[PhysicalRecord],
-    volumes: Series[VolumeRecord] | None,
+    guides: Sequence[Guide],  # the last frames' volumes, if there are any
 ) -> np.ndarray:  # [N, 3] m/s
     """Mean of the last frames' velocities there: of the physical particles and, where there are volumes, of those too.
 
     The particles' are sharper and drawn to what the pictures show, the volumes' know depth; their errors differ.
     """
-    found: list[np.ndarray] = []
+    found = [guide.velocity_at(points) for guide in guides]
     for back in range(1, min(RECENT, len(fluid)) + 1):
         record = fluid[len(fluid) - back]
         found.append(interpolate_velocity(points, as_fluid(record), float(record.smoothing_length))[0])
-        if volumes is not None and len(volumes) >= len(fluid):
-            found.append(Guide(volumes[len(fluid) - back]).velocity_at(points))
     return np.mean(found, axis=0)

@@ -14,7 +14,8 @@ import numpy as np
 
 from backend.contract.cameras import Cameras
 from backend.contract.job import ForecastConfig, PublishedConfig
-from backend.fit.future import Trust, recent_velocity, trust_of
+from backend.fit.future import Trust, recent_guides, recent_velocity, trust_of
+from backend.fit.guide import Guide
 from backend.fit.population import PER_PARTICLE, is_near_image, take
 from backend.fit.replay import births_at_foot, born_again
 from backend.fit.scene import make_scene
@@ -51,8 +52,9 @@ def run(
     last = seen[len(seen) - 1]
     trust = trust_of(last, config)
     still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
-    moving = _going_on(replace(last, next_id=2 * last.next_id), fluid, volumes)
-    births = [_going_on(newborn, fluid, volumes) for newborn in births_at_foot(seen)[-_REPLAYED:]]
+    guides = recent_guides(volumes, layers, scene) if volumes is not None and len(volumes) >= len(layers) else []
+    moving = _going_on(replace(last, next_id=2 * last.next_id), fluid, guides)
+    births = [_going_on(newborn, fluid, guides) for newborn in births_at_foot(seen)[-_REPLAYED:]]
     for step in range(config.num_frames):
         report.progress(step, config.num_frames)
         moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
@@ -68,8 +70,8 @@ def deviations(last: VisualRecord, config: ForecastConfig, *, seconds: float) ->
     return [trust.deviation(seconds * (step + 1)) for step in range(config.num_frames)]
 
 
-def _going_on(record: VisualRecord, fluid: Series[PhysicalRecord], volumes: Series[VolumeRecord] | None) -> VisualRecord:
-    return replace(record, velocities=recent_velocity(record.positions, fluid, volumes).astype(np.float32))
+def _going_on(record: VisualRecord, fluid: Series[PhysicalRecord], guides: list[Guide]) -> VisualRecord:
+    return replace(record, velocities=recent_velocity(record.positions, fluid, guides).astype(np.float32))
 
 
 def _expected(moving: VisualRecord, still: VisualRecord, trust: Trust, seconds: float) -> VisualRecord:

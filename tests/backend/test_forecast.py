@@ -13,7 +13,8 @@ import pytest
 from backend.contract.cameras import Cameras
 from backend.contract.errors import Cancelled
 from backend.contract.job import ForecastConfig, PublishedConfig
-from backend.fit.future import DOUBT, RECENT, Trust, recent_velocity, trust_of
+from backend.fit.future import DOUBT, RECENT, Trust, recent_guides, recent_velocity, trust_of
+from backend.fit.guide import Guide
 from backend.fit.scene import make_scene
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord, particle_frame
 from backend.published import future as published_future
@@ -156,16 +157,29 @@ def test_deviations_grow_with_the_horizon() -> None:
 def test_recent_velocity_is_the_mean_of_the_last_frames() -> None:
     fluid = [physical(cloud(), speed * UP) for speed in (100.0, 1.0, 2.0, 4.0, 5.0)]
     assert RECENT == 4
-    np.testing.assert_allclose(recent_velocity(cloud(9, seed=1), fluid, None), np.tile(3.0 * UP, (9, 1)), atol=1e-12)
-    np.testing.assert_allclose(recent_velocity(cloud(9, seed=1), fluid[:1], None), np.tile(100.0 * UP, (9, 1)), atol=1e-12)
-    assert recent_velocity(np.zeros((0, 3)), fluid, None).shape == (0, 3)
+    np.testing.assert_allclose(recent_velocity(cloud(9, seed=1), fluid, []), np.tile(3.0 * UP, (9, 1)), atol=1e-12)
+    np.testing.assert_allclose(recent_velocity(cloud(9, seed=1), fluid[:1], []), np.tile(100.0 * UP, (9, 1)), atol=1e-12)
+    assert recent_velocity(np.zeros((0, 3)), fluid, []).shape == (0, 3)
 
 
 def test_volumes_have_half_a_say() -> None:
-    fluid, volumes = [physical(cloud(), 1.0 * UP)] * 5, [volume(np.array([2.0, 0.0, 3.0]))] * 5
-    found = recent_velocity(cloud(9, seed=1), fluid, volumes)
+    fluid, guides = [physical(cloud(), 1.0 * UP)] * 5, [Guide(volume(np.array([2.0, 0.0, 3.0])))] * RECENT
+    found = recent_velocity(cloud(9, seed=1), fluid, guides)
     np.testing.assert_allclose(found, np.tile([1.0, 0.0, 2.0], (9, 1)), atol=1e-6)
     np.testing.assert_allclose(recent_velocity(cloud(9, seed=1), fluid, []), np.tile(UP, (9, 1)), atol=1e-12)
+
+
+def test_the_last_volumes_learn_from_the_pictures_how_their_rays_move() -> None:
+    """Proposed is smoke that stands still, shown is smoke that rises; of one picture alone nothing is learned."""
+    layers = clip(MOVING)[0]
+    still = [volume(0.01 * UP)] * 5
+    scene = make_scene(layers, CAMERAS)
+    guides = recent_guides(still, layers, scene)
+    assert len(guides) == RECENT
+    at_smoke = np.array([guide.velocity_at(cloud(9, seed=1) + 0.3 * MOVING).mean(axis=0) for guide in guides])
+    assert np.all(at_smoke[:, 2] > 0.1)
+    alone = recent_guides(still[:1], layers[:1], make_scene(layers[:1], CAMERAS))
+    np.testing.assert_array_equal(alone[0].velocity, Guide(still[0]).velocity)
 
 
 def test_pure_motion_by_hand() -> None:
