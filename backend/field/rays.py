@@ -20,13 +20,14 @@ from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 
 _SLAB = 4  # voxels along x
+_PAD = 2  # voxels: a ray is followed to one beyond the outermost, and rounding may take it a hair further
 
 
 def optical_depth(density: np.ndarray, lattice: Lattice, view: View, *, step: float = 0.5) -> np.ndarray:
     """[X, Y, Z] 1/m -> [H, W] float32; step in voxels. Raises ValueError if density does not fit the lattice."""
     values = _on_lattice(density, lattice)
     image = np.zeros((view.height, view.width), np.float32)
-    _march(values, *_placed(lattice), _camera(view), step * lattice.voxel_size, image)
+    _march(np.pad(values, _PAD), *_placed(lattice), _camera(view), step * lattice.voxel_size, image)
     return image
 
 
@@ -99,32 +100,28 @@ def _span(camera, direction, low, high):  # -> first and last distance inside th
 
 
 @njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _march(density, origin, h, camera, step, image):
-    nx, ny, nz = density.shape
+def _march(density, origin, h, camera, step, image):  # density with _PAD voxels of nothing on all sides: no sample has to ask
+    nx, ny, nz = density.shape[0] - 2 * _PAD, density.shape[1] - 2 * _PAD, density.shape[2] - 2 * _PAD
     low, high = origin - h, origin + h * np.array([nx, ny, nz], np.float64)
+    x0, y0, z0 = _along(camera, np.zeros(3), 0.0, origin, h)
     for row in prange(image.shape[0]):
         direction = np.empty(3)
         for column in range(image.shape[1]):
             _ray(camera, row, column, direction)
             near, far = _span(camera, direction, low, high)
             first, last = math.ceil(near / step), math.floor(far / step)
+            dx, dy, dz = direction[0] * step / h, direction[1] * step / h, direction[2] * step / h
             total = 0.0
             for index in range(first, last + 1):
-                x, y, z = _along(camera, direction, index * step, origin, h)
-                i, j, k = math.floor(x), math.floor(y), math.floor(z)
+                x, y, z = x0 + index * dx + _PAD, y0 + index * dy + _PAD, z0 + index * dz + _PAD
+                i, j, k = int(x), int(y), int(z)
                 fx, fy, fz = x - i, y - j, z - k
-                for a in range(2):
-                    if i + a < 0 or i + a >= nx:
-                        continue
-                    wx = fx if a else 1.0 - fx
-                    for b in range(2):
-                        if j + b < 0 or j + b >= ny:
-                            continue
-                        wy = wx * (fy if b else 1.0 - fy)
-                        if 0 <= k < nz:
-                            total += wy * (1.0 - fz) * density[i + a, j + b, k]
-                        if 0 <= k + 1 < nz:
-                            total += wy * fz * density[i + a, j + b, k + 1]
+                near_z = (1.0 - fy) * density[i, j, k] + fy * density[i, j + 1, k]
+                far_z = (1.0 - fy) * density[i, j, k + 1] + fy * density[i, j + 1, k + 1]
+                here = (1.0 - fz) * near_z + fz * far_z
+                near_z = (1.0 - fy) * density[i + 1, j, k] + fy * density[i + 1, j + 1, k]
+                far_z = (1.0 - fy) * density[i + 1, j, k + 1] + fy * density[i + 1, j + 1, k + 1]
+                total += (1.0 - fx) * here + fx * ((1.0 - fz) * near_z + fz * far_z)
             image[row, column] = total * step
 
 

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
+from backend.field.lookup import trilinear
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 
@@ -59,13 +59,7 @@ class Stand:
 
         outside: "grid-constant" for zero one voxel beyond the outermost and further, "nearest" for the nearest voxel's.
         """
-        places = self.voxels(points).T
-        if values.ndim == 3:
-            return ndimage.map_coordinates(values, places, order=1, mode=outside)
-        channels = [
-            ndimage.map_coordinates(values[..., index], places, order=1, mode=outside) for index in range(values.shape[3])
-        ]
-        return np.stack(channels, axis=1)
+        return trilinear(values, self.voxels(points), outside=outside)
 
     def matrix(self, view: View) -> np.ndarray:
         """[3, 4]: voxel indices to homogeneous pixels of a view, the first pixel's centre at 0."""

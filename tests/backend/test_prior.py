@@ -16,7 +16,7 @@ from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View, view_at
 from backend.geometry.lattice import Lattice
-from backend.prior.network import PlumeNet, Sight, _folded, _unfolded, follow, seen_at
+from backend.prior.network import Conv, PlumeNet, Sight, _folded, _unfolded, follow, seen_at
 from backend.prior.predict import SHAPE, Prior, save_weights
 from backend.prior.window import OFFSETS, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
@@ -149,6 +149,23 @@ def test_density_is_never_negative_and_none_where_the_frame_shows_none() -> None
     assert torch.isfinite(velocity).all()
     assert density[0, :4].max() == 0.0  # the grid's left is the picture's left
     assert density[0, 12:].max() > 0.0
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_convolution_answers_as_torch_s_own(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    layer = Conv(12, 8, size, padding=size // 2)
+    window = torch.randn(1, 12, 6, 6, 10, generator=torch.Generator().manual_seed(0))
+    window = window.contiguous(memory_format=torch.channels_last_3d)
+    learned = layer(window)
+    assert learned.requires_grad
+    with torch.no_grad():
+        found = layer(window)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert layer(window).dtype == torch.bfloat16
+        monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+        without = layer(window)
+    torch.testing.assert_close(found, without, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found, learned.detach(), atol=1e-5, rtol=1e-5)
 
 
 def test_weights_are_read_as_they_were_written_and_answers_do_not_depend_on_threads(tmp_path: Path) -> None:
