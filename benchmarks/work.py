@@ -26,8 +26,9 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import torch
 from numba.core.registry import CPUDispatcher
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
 from backend.estimate import machine
 from backend.io import vdb
@@ -44,6 +45,14 @@ KINDS: tuple[str, ...] = (
     "voxels_filled",
     "voxels_written",
 )
+
+
+def _convolution(window: Any, weight: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+    """Operations of oneDNN's convolution, by the shapes of what it is given and gives: torch does not count them by itself."""
+    return conv_flop_count(window, weight, out_shape)
+
+
+_CONVOLUTIONS = {torch.ops.aten.mkldnn_convolution: _convolution}
 
 
 class Tally:
@@ -149,7 +158,7 @@ def _before(method: Callable[..., Any], tally: Tally, kind: str, work: Callable[
 def _operations(method: Callable[..., Any], tally: Tally) -> Callable[..., Any]:
     @functools.wraps(method)
     def watched(*arguments: Any, **options: Any) -> Any:
-        with FlopCounterMode(display=False) as counter:  # of this thread alone
+        with FlopCounterMode(display=False, custom_mapping=_CONVOLUTIONS) as counter:  # of this thread alone
             result = method(*arguments, **options)
         tally.add("prior_operations", counter.get_total_flops())
         return result
