@@ -22,6 +22,18 @@ def trilinear(values: np.ndarray, places: np.ndarray, *, outside: str) -> np.nda
 
 
 @njit(cache=True, inline="always")
+def among(values, x, y, z):  # trilinear at a place in voxels, none negative, whose eight voxels all exist
+    i, j, k = int(x), int(y), int(z)
+    fx, fy, fz = x - i, y - j, z - k
+    near = (1.0 - fz) * values[i, j, k] + fz * values[i, j, k + 1]
+    far = (1.0 - fz) * values[i, j + 1, k] + fz * values[i, j + 1, k + 1]
+    here = (1.0 - fy) * near + fy * far
+    near = (1.0 - fz) * values[i + 1, j, k] + fz * values[i + 1, j, k + 1]
+    far = (1.0 - fz) * values[i + 1, j + 1, k] + fz * values[i + 1, j + 1, k + 1]
+    return (1.0 - fx) * here + fx * ((1.0 - fy) * near + fy * far)
+
+
+@njit(cache=True, inline="always")
 def _cell(place, count, is_nearest):  # -> voxel before the place, how far behind it
     place = min(max(place, 0.0), count - 1.0) if is_nearest else min(max(place, -2.0), count + 1.0)
     before = math.floor(place)

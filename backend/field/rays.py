@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from backend.field.lookup import among
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 
@@ -103,7 +104,7 @@ def _span(camera, direction, low, high):  # -> first and last distance inside th
 def _march(density, origin, h, camera, step, image):  # density with _PAD voxels of nothing on all sides: no sample has to ask
     nx, ny, nz = density.shape[0] - 2 * _PAD, density.shape[1] - 2 * _PAD, density.shape[2] - 2 * _PAD
     low, high = origin - h, origin + h * np.array([nx, ny, nz], np.float64)
-    x0, y0, z0 = _along(camera, np.zeros(3), 0.0, origin, h)
+    x0, y0, z0 = (camera[9:12] - origin) / h + _PAD
     for row in prange(image.shape[0]):
         direction = np.empty(3)
         for column in range(image.shape[1]):
@@ -113,15 +114,7 @@ def _march(density, origin, h, camera, step, image):  # density with _PAD voxels
             dx, dy, dz = direction[0] * step / h, direction[1] * step / h, direction[2] * step / h
             total = 0.0
             for index in range(first, last + 1):
-                x, y, z = x0 + index * dx + _PAD, y0 + index * dy + _PAD, z0 + index * dz + _PAD
-                i, j, k = int(x), int(y), int(z)
-                fx, fy, fz = x - i, y - j, z - k
-                near_z = (1.0 - fy) * density[i, j, k] + fy * density[i, j + 1, k]
-                far_z = (1.0 - fy) * density[i, j, k + 1] + fy * density[i, j + 1, k + 1]
-                here = (1.0 - fz) * near_z + fz * far_z
-                near_z = (1.0 - fy) * density[i + 1, j, k] + fy * density[i + 1, j + 1, k]
-                far_z = (1.0 - fy) * density[i + 1, j, k + 1] + fy * density[i + 1, j + 1, k + 1]
-                total += (1.0 - fx) * here + fx * ((1.0 - fz) * near_z + fz * far_z)
+                total += among(density, x0 + index * dx, y0 + index * dy, z0 + index * dz)
             image[row, column] = total * step
 
 

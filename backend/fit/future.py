@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from backend.contract.job import ForecastConfig
 from backend.fit.carry import as_fluid
 from backend.fit.guide import Guide
-from backend.fit.ray_motion import Shot, followed
+from backend.fit.ray_motion import followed
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
@@ -62,13 +62,13 @@ def trust_of(record: VisualRecord, config: ForecastConfig) -> Trust:
 
 def recent_guides(volumes: Series[VolumeRecord], layers: Series[np.ndarray], scene: Scene) -> list[Guide]:
     """The last frames' volumes, with the motion that the pictures show of each ray; layers: [H, W, 4] of all frames."""
-    last, guides = len(layers) - 1, []
+    guides = []
     for frame in range(max(0, len(layers) - RECENT), len(layers)):
-        guide, beside = Guide(volumes[frame]), range(max(0, frame - 1), min(last, frame + 1) + 1)
-        if len(beside) > 1:
-            shots = [Shot(depth=optical_depth(layers[number]), view=scene.views[number]) for number in beside]
-            guide.velocity = followed(guide, shots, beside.index(frame), seconds=scene.seconds_per_frame)
-        guides.append(guide)
+        beside = range(max(0, frame - 1), min(len(layers), frame + 2))
+        depths, views = [optical_depth(layers[number]) for number in beside], [scene.views[number] for number in beside]
+        seconds = scene.seconds_per_frame
+        velocity = followed(Guide(volumes[frame]), depths, views, beside.index(frame), seconds=seconds)
+        guides.append(Guide(replace(volumes[frame], velocity=velocity, velocity_unit=np.asarray(1.0))))
     return guides
 
 

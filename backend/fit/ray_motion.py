@@ -12,7 +12,6 @@ wide) is added to all velocities of the ray: which part of the smoke along it mo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -30,25 +29,17 @@ _EDGE = 3.0  # px at a picture's border that are not looked at
 _ITERATIONS = 40
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shot:
-    """One frame: optical depths [H, W] and the view at that size."""
-
-    depth: np.ndarray
-    view: View
-
-
-def followed(guide: Guide, shots: Sequence[Shot], middle: int, *, seconds: float) -> np.ndarray:
+def followed(guide: Guide, depths: Sequence[np.ndarray], views: Sequence[View], middle: int, *, seconds: float) -> np.ndarray:
     """Velocities [X, Y, Z, 3] m/s of a proposal, changed to what the pictures of frames beside its own show.
 
-    shots: two or three neighbouring frames, `seconds` apart; middle: which of them is the proposal's. Smoke that crosses more
-    than a voxel in a frame keeps its velocities.
+    depths: optical depths [H, W] of up to three neighbouring frames, `seconds` apart; views: of that size; middle: which of them
+    is the proposal's. A frame alone tells nothing, and smoke that crosses more than a voxel in one keeps its velocities.
     """
     own = guide.velocity @ guide.stand.from_world[:3, :3].T
     across = own[..., [0, 2]].astype(np.float64)
     density = guide.density.astype(np.float64)
     mass = density.sum(axis=1)
-    if not mass.any():
+    if len(depths) < 2 or not mass.any():
         return guide.velocity
     voxel = guide.lattice.voxel_size
     speed = float(np.sqrt(np.average(np.square(across).sum(axis=-1), weights=density)))
@@ -59,7 +50,7 @@ def followed(guide: Guide, shots: Sequence[Shot], middle: int, *, seconds: float
     mean = (across * density[..., None]).sum(axis=1) / np.where(known, mass, 1.0)[..., None]  # [X, Z, 2]
     mean = np.where(known[..., None], mean, across.mean(axis=1))
     sheet = _Sheet(guide, cells)
-    tau, change, seen = sheet.look(shots, middle)
+    tau, change, seen = sheet.look(depths, views, middle)
     if not tau.any():
         return guide.velocity
     unit = voxel / cells / seconds  # m/s: a cell a frame
@@ -94,20 +85,20 @@ class _Sheet:
             return ndimage.map_coordinates(values, self.places, order=1, mode="nearest")
         return np.stack([self.fine(values[..., index]) for index in range(values.shape[2])], axis=-1)
 
-    def look(self, shots: Sequence[Shot], middle: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, depths: Sequence[np.ndarray], views: Sequence[View], middle: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """[X', Z'] each: optical depth, its change in a frame, and whether all frames show it."""
-        depths, seen = [], np.ones(self.places.shape[1:], bool)
-        for shot in shots:
-            pixels, away = shot.view.project(self.points)
-            edge = np.array([shot.view.width, shot.view.height]) - _EDGE
+        found, seen = [], np.ones(self.places.shape[1:], bool)
+        for depth, view in zip(depths, views, strict=True):
+            pixels, away = view.project(self.points)
+            edge = np.array([view.width, view.height]) - _EDGE
             inside = (away > 0) & (pixels > _EDGE).all(axis=1) & (pixels < edge).all(axis=1)
-            size = shot.view.fx * self.cell / float(np.median(away[inside])) if inside.any() else 0.0  # px
-            blurred = ndimage.gaussian_filter(shot.depth.astype(np.float64), _BLUR * size, mode="nearest")
+            size = view.fx * self.cell / float(np.median(away[inside])) if inside.any() else 0.0  # px
+            blurred = ndimage.gaussian_filter(depth.astype(np.float64), _BLUR * size, mode="nearest")
             rows, columns = np.where(inside[:, None], pixels - 0.5, 0.0).T[::-1]
-            depths.append(ndimage.map_coordinates(blurred, [rows, columns], order=1).reshape(seen.shape))
+            found.append(ndimage.map_coordinates(blurred, [rows, columns], order=1).reshape(seen.shape))
             seen &= inside.reshape(seen.shape)
         seen = ndimage.binary_erosion(seen, np.ones((5, 5)))
-        return depths[middle], (depths[-1] - depths[0]) / (len(shots) - 1), seen
+        return found[middle], (found[-1] - found[0]) / (len(found) - 1), seen
 
 
 def _explained(tau: np.ndarray, change: np.ndarray, mean: np.ndarray, seen: np.ndarray, *, width: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from particles_of import particles
 
 from backend.geometry.camera import View
 from backend.io.particles import ParticleFrame
@@ -14,15 +15,7 @@ from backend.render.evening import REACH, evened
 
 
 def smoke(positions: np.ndarray, brightness: np.ndarray) -> ParticleFrame:
-    count = len(positions)
-    return ParticleFrame(
-        positions=positions,
-        velocities=np.zeros((count, 3), np.float32),
-        scales=np.full(count, 0.1, np.float32),
-        optical_masses=np.full(count, 0.01, np.float32),
-        colors=np.outer(brightness, [1.0, 0.5, 0.25]).astype(np.float32),
-        ids=np.arange(count),
-    )
+    return particles(positions, np.outer(brightness, [1.0, 0.5, 0.25]))
 
 
 def speckled(count: int = 4000) -> ParticleFrame:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from particles_of import particles
 from scipy.integrate import quad
 
 from backend.contract.cameras import Cameras
@@ -23,15 +24,7 @@ SUN = Light(
 
 
 def frame(positions: np.ndarray) -> ParticleFrame:
-    count = len(positions)
-    return ParticleFrame(
-        positions=positions,
-        velocities=np.zeros((count, 3), np.float32),
-        scales=np.full(count, 0.1, np.float32),
-        optical_masses=np.full(count, 0.01, np.float32),
-        colors=np.tile(np.array([0.5, 0.4, 0.3], np.float32), (count, 1)),
-        ids=np.arange(count),
-    )
+    return particles(positions, np.array([0.5, 0.4, 0.3]))
 
 
 def camera(place: tuple[float, float, float]) -> View:
