@@ -1,4 +1,4 @@
-"""Values of a grid's voxels at points between them, trilinear."""
+"""Values of a grid's voxels at points between them, trilinear; and back: what lies at points, shared among voxels."""
 
 from __future__ import annotations
 
@@ -19,6 +19,14 @@ def trilinear(values: np.ndarray, places: np.ndarray, *, outside: str) -> np.nda
     if channels.size:
         _look_up(channels, np.ascontiguousarray(places, np.float64), outside == "nearest", found)
     return found.reshape(len(places), *values.shape[3:])
+
+
+def deposited(places: np.ndarray, masses: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Masses [N] at places [N, 3], as for trilinear, shared among the eight voxels around each -> [X, Y, Z] float64; what is
+    outside is lost."""
+    total = np.zeros(shape)
+    _deposit(np.ascontiguousarray(places, np.float64), np.asarray(masses, np.float64), total)
+    return total
 
 
 @njit(cache=True, inline="always")
@@ -65,3 +73,24 @@ def _look_up(values, places, is_nearest, found):
                         total[m] += w * values[i + a, j + b, k + c, m]
         for m in range(num):
             found[n, m] = total[m]
+
+
+@njit(cache=True, error_model="numpy")
+def _deposit(places, masses, total):
+    nx, ny, nz = total.shape
+    for n in range(len(masses)):
+        px, py, pz = places[n, 0], places[n, 1], places[n, 2]
+        if not (px == px and py == py and pz == pz):
+            continue
+        (i, fx), (j, fy), (k, fz) = _cell(px, nx, False), _cell(py, ny, False), _cell(pz, nz, False)
+        for a in range(2):
+            if not 0 <= i + a < nx:
+                continue
+            wx = masses[n] * (fx if a else 1.0 - fx)
+            for b in range(2):
+                if not 0 <= j + b < ny:
+                    continue
+                wy = wx * (fy if b else 1.0 - fy)
+                for c in range(2):
+                    if 0 <= k + c < nz:
+                        total[i + a, j + b, k + c] += wy * (fz if c else 1.0 - fz)

@@ -38,10 +38,6 @@ class Guide:
         """[N, 3] m/s; outside the grid that of its nearest voxel."""
         return self.stand.at(self.velocity, points, outside="nearest")
 
-    def places(self, points: np.ndarray) -> np.ndarray:
-        """[3, N] voxels from the first one's centre."""
-        return self.stand.voxels(points).T
-
     def prior_of(self, view: View, solid: DepthPrior) -> DepthPrior:
         """Where on each ray the volume's smoke is: the middle and, from its spread, the half thickness of the profile that
         `solid` stands for; on rays that pass no smoke of the volume those of `solid`."""

@@ -1,11 +1,13 @@
 """Levels of a proposal brought to where in depth the whole clip says that they are.
 
 Two networks speak of it: the large one, for a frame, of every voxel, and a small one, from the whole clip, of the levels' middles
-and of how unsure it is of them. What they get wrong they get wrong in part apart.
+and of how unsure it is of them. Mostly the large one is right to less than a voxel, which the small one cannot better; but there
+are clips that it loses its way in, by metres and from beginning to end. Those are known by how far the two are apart.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -18,36 +20,54 @@ from backend.prior.sheets import UNIT, look_at_sheets, moments_around, parts
 from backend.prior.window import Stand
 
 OWN_ERROR = 2.0  # voxels that the middle of a proposal's level is taken to be off; tuned on ten held-back plumes and three scenes
+USUAL = 0.95  # voxels that the two are apart in a clip that the large one may as well have lost its way in as not; tuned with
+_POWER = 8  # on the same plumes and scenes: how soon it is one or the other
 _SMOOTH = 1.5  # voxels of height, standard deviation: neighbouring levels move alike
 _FAINT = 0.01  # of the fullest level: one with less does not move of itself
 
 
 class Levels:
-    """Of a clip, in its upright world. stride: frames."""
+    """Of a clip, in its upright world. stride: frames; share: of the way that levels go, all of it until `weigh` is told more."""
 
     def __init__(self, region: Region, net: LevelNet, *, stride: int) -> None:
         self.region, self.net, self.stride = region, net, stride
+        self.share = 1.0
         self.known: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
+
+    def weigh(self, proposals: Iterable[tuple[Proposal, int]]) -> None:
+        """By all that is proposed of the clip, each with its frame: whether the large network has lost its way in it."""
+        squares = total = 0.0
+        for proposal, frame in proposals:
+            apart, _, weight = self._apart(proposal, frame)
+            squares += float(weight @ np.square(apart))
+            total += float(weight.sum())
+        apart = (squares / total) ** 0.5 if total else 0.0
+        self.share = apart**_POWER / (apart**_POWER + USUAL**_POWER)
 
     def levelled(self, proposal: Proposal, frame: int) -> Proposal:
         """Each level moved along the view, with its velocities: the more of the way the surer the small network is."""
-        stand = proposal.stand
-        columns = proposal.density.sum(axis=1, dtype=np.float64)  # [X, Z]
-        mass = columns.sum(axis=0)
-        middle, unsure, asked = self._said(stand, frame)
-        counted = columns * asked
-        own = np.einsum("xyz,y->z", proposal.density, np.arange(proposal.density.shape[1])) / np.maximum(mass, 1e-12)
-        aim = (counted * middle).sum(axis=0) / np.maximum(counted.sum(axis=0), 1e-12)
-        trust = OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
-        weight = np.where((counted.sum(axis=0) > 0) & (mass > _FAINT * mass.max(initial=0.0)), mass, 0.0)
+        apart, unsure, weight = self._apart(proposal, frame)
         if not weight.any():
             return proposal
-        weight /= weight.max()
+        trust = self.share * OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
         total = ndimage.gaussian_filter1d(weight, _SMOOTH, mode="constant")
-        shift = ndimage.gaussian_filter1d(weight * trust * (aim - own), _SMOOTH, mode="constant") / (total + 1e-6)
+        shift = ndimage.gaussian_filter1d(weight * trust * apart, _SMOOTH, mode="constant") / (total + 1e-6)
         return replace(
             proposal, density=moved(proposal.density, shift), velocity=moved(proposal.velocity, shift, outside="nearest")
         )
+
+    def _apart(self, proposal: Proposal, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each level [Z]: voxels from where the proposal has its middle to where the small network does, how unsure that is in
+        voxels, and how much it counts, up to 1."""
+        columns = proposal.density.sum(axis=1, dtype=np.float64)  # [X, Z]
+        mass = columns.sum(axis=0)
+        middle, unsure, asked = self._said(proposal.stand, frame)
+        counted = columns * asked
+        seen = counted.sum(axis=0)
+        own = np.einsum("xyz,y->z", proposal.density, np.arange(proposal.density.shape[1])) / np.maximum(mass, 1e-12)
+        aim = (counted * middle).sum(axis=0) / np.maximum(seen, 1e-12)
+        weight = np.where((seen > 0) & (mass > _FAINT * mass.max(initial=0.0)), mass, 0.0)
+        return aim - own, unsure, weight / max(float(weight.max(initial=0.0)), 1e-12)
 
     def _said(self, stand: Stand, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For the grid of a frame: where the middle of each column's smoke is [X, Z] voxels, of each level how unsure that is [Z]

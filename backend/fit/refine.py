@@ -18,12 +18,13 @@ from backend.render import splat as renderer
 from backend.render.composite import composite, composite_backward
 from backend.render.gaussians import Gaussians, isotropic
 
-POSITION_STEP = 0.10  # of the own scale, an iteration
-LOG_STEP = 0.06  # of log mass, an iteration
-LOG_SCALE_STEP = 0.02
-COLOR_STEP = 0.02
+POSITION_STEP = 0.075  # of the scale at birth, an iteration
+LOG_STEP = 0.0225  # of log mass, an iteration: what the picture says of it the updates before have taken already
+LOG_SCALE_STEP = 0.03
+COLOR_STEP = 0.03
+FLOOR = 0.2  # of Adam's: what hardly matters to this picture hardly moves, for it may matter to others
 POSITION_PULL = 0.05  # strength of the pull to the carried position, in units of the data term's own gradient
-SCALE_RANGE = (0.6, 2.0)  # of the scale at birth
+SCALE_RANGE = (0.5, 3.0)  # of the scale at birth
 
 
 def as_gaussians(record: VisualRecord) -> Gaussians:
@@ -58,12 +59,13 @@ def refine(
     log_masses = np.log(np.maximum(record.optical_masses.astype(np.float64), 1e-30))
     colors = record.colors.astype(np.float64) if channels is None else record.colors.astype(np.float64) @ channels.T
     positions = carried.copy()
-    adam = {
-        "positions": Adam.like(positions, POSITION_STEP * reference_scale),
-        "scales": Adam.like(scales, LOG_SCALE_STEP),
-        "masses": Adam.like(log_masses, LOG_STEP),
-        "colors": Adam.like(colors, COLOR_STEP * (3.0 / colors.shape[1]) ** 0.5),  # as far as three equal channels go
+    steps = {
+        "positions": (positions, POSITION_STEP * reference_scale),
+        "scales": (scales, LOG_SCALE_STEP),
+        "masses": (log_masses, LOG_STEP),
+        "colors": (colors, COLOR_STEP * (3.0 / colors.shape[1]) ** 0.5),  # as far as three equal channels go
     }
+    adam = {name: Adam.like(values, step, floor=FLOOR) for name, (values, step) in steps.items()}
     loss = 0.0
     for _ in range(iterations):
         current = replace(

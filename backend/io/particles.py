@@ -95,6 +95,7 @@ class ParticlesWriter:
         self._offsets = [0]
         self._num_forecast = 0
         self._is_anisotropic: bool | None = None
+        self._datasets: dict[str, Any] = {}  # kept open: one that is closed packs its last chunk, and unpacks it again
         self._lives = _Lives()
         self._is_finished = False
         self._stack = ExitStack()
@@ -131,10 +132,9 @@ class ParticlesWriter:
             raise ValueError(f"frame {index}: either all frames have rotations or none")
         self._lives.see(frame.ids, index)
         start, stop = self._offsets[-1], self._offsets[-1] + frame.count
-        group: Any = self._file["particles"]
-        for name in columns:
-            group[name].resize(stop, axis=0)
-            group[name][start:stop] = getattr(frame, name)
+        for name, dataset in self._datasets.items():
+            dataset.resize(stop, axis=0)
+            dataset[start:stop] = getattr(frame, name)
         self._check_storage()
         self._offsets.append(stop)
         self._num_forecast += is_forecast
@@ -181,6 +181,7 @@ class ParticlesWriter:
                 track_times=False,
             )
             dataset.attrs["unit"] = np.bytes_(PARTICLES_UNITS.get(name, "1").encode())
+            self._datasets[name] = dataset
 
 
 class Particles:
@@ -209,8 +210,7 @@ class Particles:
             raise IndexError(index)
         rows = slice(int(self._offsets[index]), int(self._offsets[index + 1]))
         try:
-            group: Any = self._file["particles"]
-            values: dict[str, np.ndarray] = {name: group[name][rows] for name in self._columns}
+            values: dict[str, np.ndarray] = {name: dataset[rows] for name, dataset in self._datasets.items()}
             frame = ParticleFrame(**values)
             _check_frame(frame, self._columns, name=f"frame {index}")
         except _DAMAGED as error:
@@ -240,6 +240,7 @@ class Particles:
         self.num_frames = int(file.attrs["num_frames"])
         self.num_forecast = int(file.attrs["num_forecast"])
         self._columns = _columns("rotations" in file["particles"])
+        self._datasets = {name: file["particles"][name] for name in self._columns}
         self._offsets = self._checked_offsets(file)
         identities = file["identities"]
         self.ids: np.ndarray = _bounded(identities["ids"], self._path)  # [K] int64, ascending
@@ -273,8 +274,8 @@ class Particles:
         total = int(offsets[-1])
         if offsets[0] != 0 or np.any(np.diff(offsets) < 0):
             raise ValueError("frames overlap")
-        for name, (_, shape) in self._columns.items():
-            dataset = file["particles"][name]
+        for name, dataset in self._datasets.items():
+            shape = self._columns[name][1]
             if dataset.shape != (total, *shape):
                 raise ValueError(f"{name} has shape {dataset.shape} for {total} particles")
             _check_size(dataset, self._path)

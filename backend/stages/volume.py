@@ -7,7 +7,7 @@ what lasts around a frame and with what the frame shows (`run`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -26,6 +26,7 @@ from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
 from backend.geometry.upright import turned, up_of, upright
+from backend.prior.levels import LevelNet
 from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
 from backend.prior.window import stand_before
 from backend.reporting import Report
@@ -142,28 +143,35 @@ def propose(
     done: Series[VolumeRecord],
     num_workers: int = 0,  # frames at once, each in a thread; 0: as many as torch has threads. The bytes are the same
 ) -> Iterator[VolumeRecord]:
-    """Yields what the prior says of the asked frames behind those that are `done`, in the upright world: each frame's own word,
-    with its levels where the whole clip says that they are."""
+    """Yields what the prior says of the asked frames behind those that are `done`, in the upright world: each one's own word."""
     num_done = len(done)
-    levels = None if prior.levels is None else Levels(plan.region, prior.levels, stride=plan.stride)
-    answers = _answers(plan, report, plan.asked[num_done:], prior, num_workers, done=_LONGER * (plan.probes + num_done))
-    for frame, answer in zip(plan.asked[num_done:], answers, strict=True):
-        found = answer if levels is None else levels.levelled(answer, frame)
-        yield _packed(found, answer.stand.from_world)
+    for answer in _answers(plan, report, plan.asked[num_done:], prior, num_workers, done=_LONGER * (plan.probes + num_done)):
+        yield _packed(answer, answer.stand.from_world)
 
 
-def run(plan: Plan, report: Report, proposals: Series[VolumeRecord]) -> Iterator[VolumeRecord]:
-    """Yields the records of all frames. proposals: what `propose` made of all asked frames."""
-    lasts = Lasting(plan.region, lambda index: _unpacked(proposals[index]), plan.asked, stride=plan.stride)
-    before = after = _unpacked(proposals[0])
+def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None = None) -> Iterator[VolumeRecord]:
+    """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels: the prior's network of them,
+    if it has one."""
+    words = _levelled(plan, proposals, levels)
+    lasts = Lasting(plan.region, words, plan.asked, stride=plan.stride)
+    before = after = words(0)
     yield plan.record(before, lasts.at(before.stand, 0), 0)
     for index, last in enumerate(plan.asked[1:]):
-        before, after = after, _unpacked(proposals[index + 1])
+        before, after = after, words(index + 1)
         for frame in range(plan.asked[index] + 1, last + 1):
             report.progress(plan.work - len(plan.region.depths) + frame, plan.work)
             proposal = plan.amid(before, after, index, frame)
             yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
     report.progress(plan.work, plan.work)
+
+
+def _levelled(plan: Plan, proposals: Series[VolumeRecord], net: LevelNet | None) -> Callable[[int], Proposal]:
+    """What the prior said of each asked frame, by number, with its levels where the whole clip says that they are."""
+    if net is None:
+        return lambda index: _unpacked(proposals[index])
+    levels = Levels(plan.region, net, stride=plan.stride)
+    levels.weigh((_unpacked(proposals[index]), frame) for index, frame in enumerate(plan.asked))
+    return lambda index: levels.levelled(_unpacked(proposals[index]), plan.asked[index])
 
 
 def _answers(

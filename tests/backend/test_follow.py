@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.fit.follow import MOST_RATIO, Balance, deposited, drawn_level, points_on_rays, weighted_poisson
+from backend.fit.follow import MOST_RATIO, Balance, drawn_level, points_on_rays
 from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
@@ -32,17 +32,6 @@ def guide_of(centre: np.ndarray, size: float = 1.2) -> Guide:
 
 def cloud(centre: np.ndarray, size: float, count: int = 40_000) -> np.ndarray:
     return centre + np.random.default_rng(2).normal(0, size, (count, 3))
-
-
-def test_masses_are_shared_and_kept() -> None:
-    rng = np.random.default_rng(1)
-    places = rng.uniform(0.0, 7.0, (3, 500))
-    masses = rng.random(500)
-    total = deposited(places, masses, (8, 8, 8))
-    assert total.sum() == pytest.approx(masses.sum())
-    middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
-    np.testing.assert_allclose(middle, (places * masses).sum(axis=1) / masses.sum(), atol=1e-9)
-    assert deposited(np.full((3, 1), 40.0), np.ones(1), (8, 8, 8)).sum() == 0.0
 
 
 def test_beside_the_grid_nobody_moves_or_grows() -> None:
@@ -93,20 +82,6 @@ def test_a_cloud_in_its_volume_stays() -> None:
     moved = Balance(guide_of(MIDDLE), points, np.full(len(points), 3.0)).displacement()
     assert np.abs(moved.mean(axis=0)).max() < 0.02
     assert np.median(np.linalg.norm(moved, axis=1)) < 0.08
-
-
-def test_a_weighted_flow_has_the_divergence_that_was_asked_for() -> None:
-    rng = np.random.default_rng(4)
-    weight = rng.uniform(0.2, 2.0, (9, 8, 7))
-    potential = rng.normal(size=(9, 8, 7))
-    wanted = np.zeros_like(weight)
-    for axis in range(3):
-        face = 0.5 * (np.delete(weight, 0, axis) + np.delete(weight, -1, axis))
-        wanted += np.diff(face * np.diff(potential, axis=axis), axis=axis, prepend=0.0, append=0.0)
-    found = weighted_poisson(weight, wanted)
-    error = (found - found.mean()) - (potential - potential.mean())
-    assert np.linalg.norm(error) < 0.1 * np.linalg.norm(potential)
-    assert np.abs(weighted_poisson(weight, np.zeros_like(weight))).max() == 0.0
 
 
 def test_no_smoke_moves_nobody() -> None:

@@ -43,7 +43,7 @@ def test_it_is_looked_up_in_the_world() -> None:
     wanted = np.exp(-0.5 * np.square((points - centre) / 1.2).sum(axis=1))
     np.testing.assert_allclose(guide.density_at(points), wanted, atol=0.05)
     assert guide.density_at(MIDDLE[None] + 100.0)[0] == 0.0
-    np.testing.assert_allclose(guide.places(MIDDLE[None])[:, 0], (11.5, 11.5, 19.5), atol=1e-9)
+    np.testing.assert_allclose(guide.stand.voxels(MIDDLE[None])[0], (11.5, 11.5, 19.5), atol=1e-9)
 
 
 def test_it_tells_the_middle_and_the_thickness_on_each_ray() -> None:

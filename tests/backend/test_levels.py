@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from backend.fit import levelled
 from backend.fit.levelled import OWN_ERROR, Levels, moved
 from backend.fit.region import Region
 from backend.geometry.camera import View, view_at
@@ -214,10 +215,28 @@ def test_levels_go_the_further_the_surer_they_are(unsure: float, least: float, m
     assert found.density.dtype == found.velocity.dtype == np.float32
 
 
+@pytest.mark.parametrize(("usual", "least", "most"), [(0.7, 0.9, 1.0), (1.0, 0.48, 0.52), (1.5, 0.0, 0.05)])
+def test_levels_go_where_the_clip_says_if_the_large_network_has_lost_its_way(
+    monkeypatch: pytest.MonkeyPatch, usual: float, least: float, most: float
+) -> None:
+    """usual: times as far as the two are apart here."""
+    proposal = upright_column(9.0)
+    levels = Levels(region(leaning()), Sure(-6.0), stride=2)
+    aim = float(proposal.stand.voxels(SOURCE[None])[0, 1]) + UNIT
+    monkeypatch.setattr(levelled, "USUAL", usual * abs(aim - 9.0))
+    levels.weigh([(proposal, 20), (proposal, 30)])
+    share = (middles(levels.levelled(proposal, 30).density) - 9.0)[8:28] / (aim - 9.0)
+    assert levels.share == pytest.approx(1.0 / (1.0 + usual**8), abs=0.02)
+    assert (share > least).all()
+    assert (share < most + 1e-3).all()
+
+
 def test_of_a_black_clip_nothing_moves() -> None:
     proposal = upright_column(9.0)
     black = Levels(region(lambda _: np.zeros((50, 60), np.float32)), Sure(-6.0), stride=2)
     assert black.levelled(proposal, 30).density is proposal.density
+    black.weigh([(proposal, 30)])
+    assert black.share == 0.0
     nothing = replace(proposal, density=np.zeros(SHAPE, np.float32))
     assert not Levels(region(leaning()), Sure(-6.0), stride=2).levelled(nothing, 30).density.any()
 

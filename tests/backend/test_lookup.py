@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from backend.field.lookup import trilinear
+from backend.field.lookup import deposited, trilinear
 
 
 @pytest.mark.parametrize("outside", ["grid-constant", "nearest"])
@@ -29,3 +29,14 @@ def test_no_points_no_voxels_and_no_numbers() -> None:
     assert trilinear(np.ones((3, 3, 3, 2)), np.zeros((0, 3)), outside="nearest").shape == (0, 2)
     assert trilinear(np.zeros((0, 0, 0), np.float32), np.zeros((2, 3)), outside="nearest").tolist() == [0.0, 0.0]
     assert trilinear(values, np.array([[np.nan, 1.0, 1.0], [1.0, 1.0, 1.0]]), outside="nearest").tolist() == [0.0, 1.0]
+
+
+def test_masses_are_shared_and_kept() -> None:
+    rng = np.random.default_rng(1)
+    places = rng.uniform(0.0, 7.0, (500, 3))
+    masses = rng.random(500)
+    total = deposited(places, masses, (8, 8, 8))
+    assert total.sum() == pytest.approx(masses.sum())
+    middle = np.stack([(total * axis).sum() for axis in np.indices((8, 8, 8))]) / total.sum()
+    np.testing.assert_allclose(middle, masses @ places / masses.sum(), atol=1e-9)
+    assert deposited(np.array([[40.0] * 3, [np.nan] * 3]), np.ones(2), (8, 8, 8)).sum() == 0.0

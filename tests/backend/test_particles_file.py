@@ -14,6 +14,7 @@ import pytest
 
 from backend.contract.cameras import Cameras
 from backend.contract.errors import BackendError
+from backend.io.hdf5_sink import Hdf5Sink
 from backend.io.particles import ParticleFrame, ParticlesInfo, ParticlesWriter, read_particles
 
 EYE = ((1.0, 0.0, 0.0, 0.5), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -118,6 +119,20 @@ def test_many_rows_cross_the_borders_of_chunks(tmp_path: Path) -> None:
     with read_particles(write(tmp_path / "p.h5", frames)) as particles:
         for index, frame in enumerate(frames):
             np.testing.assert_array_equal(particles.frame(index).positions, frame.positions)
+
+
+def test_a_chunk_is_packed_once_however_many_frames_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = []
+    put = Hdf5Sink.write
+
+    def counted(sink: Hdf5Sink, data: memoryview) -> int:
+        written.append(len(data))
+        return put(sink, data)
+
+    monkeypatch.setattr(Hdf5Sink, "write", counted)
+    frames = [frame_of(list(range(100 * step, 100 * step + 100)), seed=step) for step in range(40)]
+    path = write(tmp_path / "particles.h5", frames)
+    assert sum(written) < 1.2 * path.stat().st_size
 
 
 def test_nothing_appears_unless_it_was_finished(tmp_path: Path) -> None:

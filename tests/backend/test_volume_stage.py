@@ -63,7 +63,8 @@ def volumes(
     assert plan is not None
     report, shared = SilentReport(), {"prior": prior, "num_workers": num_workers}
     plan = volume.centred(plan, report, **shared)
-    return list(volume.run(plan, report, list(volume.propose(plan, report, done=[], **shared))))
+    proposals = list(volume.propose(plan, report, done=[], **shared))
+    return list(volume.run(plan, report, proposals, levels=prior.levels))
 
 
 def layers() -> list[np.ndarray]:
