@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -296,3 +297,26 @@ def test_what_only_borders_on_the_image_does_not_grow() -> None:
     refined, _ = refine(record, layer, view, iterations=20, reference_scale=0.25)
     assert refined.optical_masses[0] <= record.optical_masses[0]
     assert refined.optical_masses[1] > 1.5 * record.optical_masses[1]
+
+
+def test_what_a_picture_hardly_tells_hardly_changes() -> None:
+    """Two particles apart from each other, both twice as heavy as the picture says; of one it shows little."""
+    view = View(width=40, height=40, fx=40.0, fy=40.0, cx=20.0, cy=20.0, camera_to_world=np.eye(4))
+    record = VisualRecord(
+        positions=np.array([[-2.0, 0.0, 10.0], [2.0, 0.0, 10.0]]),
+        velocities=np.zeros((2, 3), np.float32),
+        scales=np.full(2, 0.4, np.float32),
+        optical_masses=np.array([0.5, 0.05], np.float32),
+        colors=np.full((2, 3), 0.5, np.float32),
+        ids=np.arange(2),
+        born=np.zeros(2, np.int32),
+        next_id=np.asarray(2),
+    )
+    shown = replace(record, optical_masses=0.5 * record.optical_masses)
+    splat = renderer.forward(as_gaussians(shown), view, features=shown.colors)
+    color, opacity = composite(splat.image)
+    layer = np.concatenate([np.moveaxis(color, 0, -1), opacity[..., None]], axis=2)
+    refined, _ = refine(record, layer, view, iterations=8, reference_scale=0.4)
+    change = np.log(refined.optical_masses / record.optical_masses)
+    assert change[0] < -0.05
+    assert abs(change[1]) < 0.3 * abs(change[0])
