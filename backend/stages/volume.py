@@ -149,9 +149,9 @@ def propose(
         yield _packed(answer, answer.stand.from_world)
 
 
-def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None = None) -> Iterator[VolumeRecord]:
-    """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels: the prior's network of them,
-    if it has one."""
+def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None) -> Iterator[VolumeRecord]:
+    """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels: the prior's network of them;
+    None where it has none."""
     words = _levelled(plan, proposals, levels)
     lasts = Lasting(plan.region, words, plan.asked, stride=plan.stride)
     before = after = words(0)
