@@ -126,7 +126,7 @@ class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
     )
     every: IntProperty(
         name="Every",
-        description="Frames from one that it is asked about to the next, at most a stride; between, smoke is carried along",
+        description="Frames from one that it is asked about to the next, at most two strides; between, smoke is carried along",
         default=5,
         min=1,
         max=16,

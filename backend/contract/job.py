@@ -103,7 +103,7 @@ class VolumeConfig:
 
     use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
     stride: frames between the images that it compares; 0 finds it from the motion.
-    every: frames from one that it is asked about to the next, at most a stride; what lies between is carried along.
+    every: frames from one that it is asked about to the next, at most two strides; what lies between is carried along.
     """
 
     use_prior: bool = True

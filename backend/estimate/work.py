@@ -63,7 +63,7 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
         "smoke": [Term(name="write", kind="pixels", amount=count * pixels)],
     }
     if asks_prior(config):
-        asked = math.ceil(count / min(config.volume.every, longest_stride(count)))
+        asked = math.ceil(count / min(config.volume.every, 2 * longest_stride(count)))
         asked += ROUNDS * num_probes(asked)
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),

@@ -95,7 +95,7 @@ class Plan:
 def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, every: int = 1) -> Plan | None:
     """None of a clip without smoke. layers: [H, W, 4] float32 premultiplied linear RGB and opacity.
 
-    stride: frames between the images that are compared; 0: found from the motion. every: frames, at most a stride: the prior
+    stride: frames between the images that are compared; 0: found from the motion. every: frames, at most two strides: the prior
     is asked so often. The prior knows upright worlds only: the scene is turned upright before it is asked, its answer back.
     """
     scene = make_scene(layers, cameras)
@@ -106,7 +106,7 @@ def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, 
     if region is None:
         return None
     stride, last = stride or stride_of(region), len(layers) - 1
-    asked = (*range(0, last, min(every, stride)), last)
+    asked = (*range(0, last, min(every, 2 * stride)), last)
     return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked)
 
 

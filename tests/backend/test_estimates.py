@@ -68,14 +68,14 @@ def test_every_stage_is_counted_and_every_term_known(preset: str, method: str, a
 
 
 def test_the_prior_is_asked_now_and_then() -> None:
-    """Every fifth of a hundred frames, and twice about five before; every second of ten, where that is the longest stride, and
-    twice about two."""
+    """Every fifth of a hundred frames, and twice about five before; every fourth of ten, where half of that is the longest
+    stride, and twice about one."""
     counts = {}
     for frames in (10, 100):
         terms = terms_of(seen(num_frames=frames), preset_config("draft"), threads=1)["volume"]
         counts[frames] = {term.name: term.amount for term in terms}
     assert counts[100]["propose"] == pytest.approx(20 + 2 * 5)
-    assert counts[10]["propose"] == pytest.approx(5 + 2 * 2)
+    assert counts[10]["propose"] == pytest.approx(3 + 2 * 1)
 
 
 @pytest.mark.parametrize(
