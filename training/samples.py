@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from backend.field.rays import optical_depth
-from backend.fit.pace import longest_stride
+from backend.fit.pace import STEP, longest_stride
 from backend.fit.region import CELLS_HIGH, CELLS_WIDE, PIXELS_A_CELL
 from backend.fit.scene import meeting_point
 from backend.geometry.camera import View
@@ -22,7 +22,7 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 _WHOLE = 0.65  # of the lessons: their pictures show all of the smoke, and the grid holds it
 LEAST, MOST = (34, 64), (56, 96)  # px, width and height of pictures: smoke leaves those that are small
 LEAST_WHOLE = (46, 76)  # px, of pictures that show all of it
-_STEP = 1.05  # voxels that smoke moves in a stride, where a fit sees 0.7 in the pictures: rays mix what goes many ways
+_STEP = 1.5 * STEP  # voxels that smoke moves in a stride, where a fit sees STEP in the pictures: rays mix what goes many ways
 _STEP_SPREAD = 0.25  # of its logarithm
 _SHORTEST = 15, 90  # frames of a clip, of one lesson in two
 _OFF, _OFTEN = (1.5, 4.5), (0.5, 0.5)  # voxels, by which grids stand beside the smoke: taught that they stand right, the prior

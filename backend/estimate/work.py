@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from backend.contract.job import Config
 from backend.estimate.machine import HEIGHT, NUM_PARTICLES, WIDTH
-from backend.fit.pace import longest_stride
+from backend.fit.pace import gap_of, longest_stride
 from backend.fit.region import ROUNDS, num_probes
 from backend.fit.survey import Survey
 
@@ -63,7 +63,7 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
         "smoke": [Term(name="write", kind="pixels", amount=count * pixels)],
     }
     if asks_prior(config):
-        asked = math.ceil(count / min(config.volume.every, 2 * longest_stride(count)))
+        asked = math.ceil(count / gap_of(config.volume.every, stride=longest_stride(count)))
         asked += ROUNDS * num_probes(asked)
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),

@@ -1,4 +1,4 @@
-"""How fast the smoke of a clip moves, roughly: over how many frames the prior should compare images."""
+"""How fast smoke moves, roughly: over how many frames the prior should compare images, and how often it is asked."""
 
 from __future__ import annotations
 
@@ -11,20 +11,26 @@ _PAIRS = 12  # of frames that are looked at
 _CLEAR = 0.7  # px that smoke should move between two frames for its motion to be told
 _LONGEST = 16  # frames between them
 _STRIDES = 4  # at least, in a clip
-_STEP = 0.7  # voxels that smoke should move in a stride. Tuned on ten held-back plumes and three scenes
+STEP = 0.7  # voxels that smoke should move across the picture in a stride. Tuned on ten held-back plumes and three scenes
+_MOST_STRIDES = 2  # from one frame that the prior is asked about to the next
 
 
 def stride_of(region: Region) -> int:
-    """Frames in which smoke moves about one voxel; 1 where nothing moves or everything is too fast."""
+    """Frames in which smoke moves STEP voxels; 1 where nothing moves or everything is too fast."""
     metres = _metres_a_frame(region)
     if metres <= 0.0:
         return 1
-    return int(np.clip(round(_STEP * region.voxel_size / metres), 1, longest_stride(len(region.depths))))
+    return int(np.clip(round(STEP * region.voxel_size / metres), 1, longest_stride(len(region.depths))))
 
 
 def longest_stride(num_frames: int) -> int:
     """Of a clip, in frames: some fit in, and over each of them motion can be measured."""
     return int(np.clip(num_frames // _STRIDES, 1, _LONGEST))
+
+
+def gap_of(every: int, *, stride: int) -> int:
+    """Frames from one that the prior is asked about to the next: as the setting says, but never more than two strides."""
+    return min(every, _MOST_STRIDES * stride)
 
 
 def _metres_a_frame(region: Region) -> float:

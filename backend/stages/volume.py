@@ -19,7 +19,7 @@ from backend.fit.between import between
 from backend.fit.guide import Guide
 from backend.fit.lasting import Lasting
 from backend.fit.levelled import Levels
-from backend.fit.pace import stride_of
+from backend.fit.pace import gap_of, stride_of
 from backend.fit.region import ROUNDS, Region, find_region, num_probes
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
@@ -106,7 +106,7 @@ def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, 
     if region is None:
         return None
     stride, last = stride or stride_of(region), len(layers) - 1
-    asked = (*range(0, last, min(every, 2 * stride)), last)
+    asked = (*range(0, last, gap_of(every, stride=stride)), last)
     return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked)
 
 

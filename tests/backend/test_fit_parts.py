@@ -270,53 +270,50 @@ def test_who_is_near_the_image() -> None:
     np.testing.assert_array_equal(is_near_image(points, view), [True, True, False, False])
 
 
-def test_what_only_borders_on_the_image_does_not_grow() -> None:
-    """A particle beside the image whose tail is the only one to reach a bright border pixel: explaining that pixel with it would
-    take a thousand times its mass. It keeps its mass; one that is in the image grows."""
-    view = View(width=40, height=40, fx=40.0, fy=40.0, cx=20.0, cy=20.0, camera_to_world=np.eye(4))
-    beside, inside = [5.6, 0.0, 10.0], [0.0, 0.0, 10.0]  # 2.4 px to the right of the image; its middle
-    layer = np.zeros((40, 40, 4), np.float32)
-    layer[18:23, 39] = layer[18:23, 18:23] = 0.5
-    record = VisualRecord(
-        positions=np.array([beside, inside]),
+SMALL = View(width=40, height=40, fx=40.0, fy=40.0, cx=20.0, cy=20.0, camera_to_world=np.eye(4))
+
+
+def pair(positions: list[list[float]], *, masses: tuple[float, float], scale: float, color: float) -> VisualRecord:
+    """Two particles, alike but for place and mass."""
+    return VisualRecord(
+        positions=np.array(positions),
         velocities=np.zeros((2, 3), np.float32),
-        scales=np.full(2, 0.25, np.float32),
-        optical_masses=np.full(2, 1e-3, np.float32),
-        colors=np.ones((2, 3), np.float32),
+        scales=np.full(2, scale, np.float32),
+        optical_masses=np.array(masses, np.float32),
+        colors=np.full((2, 3), color, np.float32),
         ids=np.arange(2),
         born=np.zeros(2, np.int32),
         next_id=np.asarray(2),
     )
+
+
+def test_what_only_borders_on_the_image_does_not_grow() -> None:
+    """A particle beside the image whose tail is the only one to reach a bright border pixel: explaining that pixel with it would
+    take a thousand times its mass. It keeps its mass; one that is in the image grows."""
+    beside, inside = [5.6, 0.0, 10.0], [0.0, 0.0, 10.0]  # 2.4 px to the right of the image; its middle
+    layer = np.zeros((40, 40, 4), np.float32)
+    layer[18:23, 39] = layer[18:23, 18:23] = 0.5
+    record = pair([beside, inside], masses=(1e-3, 1e-3), scale=0.25, color=1.0)
     _, fitted = explain.fit_masses(
-        renderer.forward(as_gaussians(record), view), record.optical_masses, optical_depth(layer), iterations=12, consistency=0.0
+        renderer.forward(as_gaussians(record), SMALL), record.optical_masses, optical_depth(layer), iterations=12, consistency=0.0
     )
     assert fitted[0] > 100 * record.optical_masses[0]  # what would happen
-    kept = not_grown_beside(fitted, record.optical_masses, record.positions, view)
+    kept = not_grown_beside(fitted, record.optical_masses, record.positions, SMALL)
     assert kept[0] == record.optical_masses[0]
     assert kept[1] == fitted[1] > 10 * record.optical_masses[1]
-    refined, _ = refine(record, layer, view, iterations=20, reference_scale=0.25)
+    refined, _ = refine(record, layer, SMALL, iterations=20, reference_scale=0.25)
     assert refined.optical_masses[0] <= record.optical_masses[0]
     assert refined.optical_masses[1] > 1.5 * record.optical_masses[1]
 
 
 def test_what_a_picture_hardly_tells_hardly_changes() -> None:
     """Two particles apart from each other, both twice as heavy as the picture says; of one it shows little."""
-    view = View(width=40, height=40, fx=40.0, fy=40.0, cx=20.0, cy=20.0, camera_to_world=np.eye(4))
-    record = VisualRecord(
-        positions=np.array([[-2.0, 0.0, 10.0], [2.0, 0.0, 10.0]]),
-        velocities=np.zeros((2, 3), np.float32),
-        scales=np.full(2, 0.4, np.float32),
-        optical_masses=np.array([0.5, 0.05], np.float32),
-        colors=np.full((2, 3), 0.5, np.float32),
-        ids=np.arange(2),
-        born=np.zeros(2, np.int32),
-        next_id=np.asarray(2),
-    )
+    record = pair([[-2.0, 0.0, 10.0], [2.0, 0.0, 10.0]], masses=(0.5, 0.05), scale=0.4, color=0.5)
     shown = replace(record, optical_masses=0.5 * record.optical_masses)
-    splat = renderer.forward(as_gaussians(shown), view, features=shown.colors)
+    splat = renderer.forward(as_gaussians(shown), SMALL, features=shown.colors)
     color, opacity = composite(splat.image)
     layer = np.concatenate([np.moveaxis(color, 0, -1), opacity[..., None]], axis=2)
-    refined, _ = refine(record, layer, view, iterations=8, reference_scale=0.4)
+    refined, _ = refine(record, layer, SMALL, iterations=8, reference_scale=0.4)
     change = np.log(refined.optical_masses / record.optical_masses)
     assert change[0] < -0.05
     assert abs(change[1]) < 0.3 * abs(change[0])
