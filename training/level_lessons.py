@@ -16,7 +16,7 @@ import numpy as np
 
 from backend.field.rays import optical_depth
 from backend.fit.region import CELLS_HIGH, PIXELS_A_CELL
-from backend.fit.scene import meeting_point
+from backend.fit.source import source_point
 from backend.io.atomic import whole_file
 from backend.prior.sheets import NUM_PARTS, PART, UNIT, look_at_sheets, moments_around
 from backend.prior.window import away_of
@@ -71,7 +71,7 @@ def draw_clip(plume: Plume, draw: np.random.Generator) -> dict[str, np.ndarray] 
     if sum(plume.density_at(first + int(frame)).sum(dtype=np.float64) for frame in seen[:: len(seen) // 4]) < _FAINT:
         return None
     foot = [int(frame) for frame in seen[:: max(1, len(seen) // FOOT_FRAMES)]]
-    source = meeting_point(lambda index: clear_depth_at(foot[index]), [views[frame] for frame in foot], most_frames=len(foot))
+    source = source_point(lambda index: clear_depth_at(foot[index]), [views[frame] for frame in foot], most_frames=len(foot))
     source = source + draw.normal(0.0, 0.15, 3)
     sheets = look_at_sheets(depth_at, lambda index: views[index], source, frames, height=height, voxel_size=cell, stride=stride)
     levels = lattice.origin[2] + plume.voxel_size * np.arange(lattice.shape[2])

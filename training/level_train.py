@@ -1,6 +1,6 @@
 """Train the network of levels on its lessons; every tenth plume is held back and scored.
 
-  python -m training.level_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 5000] [--start OTHER.npz]
+  python -m training.level_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 5000] [--start OTHER.npz [--share 0.5]]
 
 OUT.npz: the weights as they ship, the large network's of OTHER.npz and with them the running mean of this one's. The log, a line
 of JSON at each twentieth part, goes to standard output.
@@ -136,6 +136,15 @@ def score(net: LevelNet, clips: Clips) -> dict[str, float]:
     return {name: round(value.item(), 4) for name, value in means.items()}
 
 
+def mixed(start: LevelNet, learned: LevelNet, share: float) -> LevelNet:
+    """The net whose weights lie between those of two, by so much nearer to `learned`."""
+    net = copy.deepcopy(start)
+    with torch.no_grad():
+        for weight, other in zip(net.parameters(), learned.parameters(), strict=True):
+            weight.lerp_(other, share)
+    return net
+
+
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lessons", type=Path, required=True)
@@ -145,6 +154,12 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--channels", type=int, default=64)
     parser.add_argument("--start", type=Path, help="weights that are taught on")
+    parser.add_argument(
+        "--share",
+        type=float,
+        default=1.0,
+        help="of what is learned in what ships, the rest as at the start: few lessons teach them by heart (Wortsman et al. 2022)",
+    )
     given = parser.parse_args(arguments)
     paths = sorted(given.lessons.glob("*.npz"))
     held = held_back(paths)
@@ -153,7 +168,7 @@ def main(arguments: list[str]) -> int:
     beside = read_net(given.beside)
     net = (read_level_net(given.start) if given.start else None) or LevelNet(given.channels)
     net.train()
-    mean = copy.deepcopy(net)
+    start, mean = copy.deepcopy(net), copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-3)
     begin, sums, since = time.monotonic(), torch.zeros(4), 0
     for step in range(given.steps):
@@ -179,12 +194,12 @@ def main(arguments: list[str]) -> int:
             line = {
                 "steps": step + 1,
                 "taught": [round(UNIT * taught[0].item() ** 0.5, 4), round(taught[3].item(), 4)],
-                **score(mean, unseen),
+                **score(mixed(start, mean, given.share), unseen),
             }
             print(json.dumps(line | {"seconds": round(time.monotonic() - begin, 1)}), flush=True)
             sums, since = torch.zeros(4), 0
             with whole_file(given.out) as target, open(target, "wb") as file:
-                save_weights(beside, file, mean)
+                save_weights(beside, file, mixed(start, mean, given.share))
     return 0
 
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from backend.field.rays import optical_depth
 from backend.fit.pace import STEP, longest_stride
 from backend.fit.region import CELLS_HIGH, CELLS_WIDE, PIXELS_A_CELL
-from backend.fit.scene import meeting_point
+from backend.fit.source import source_point
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 from backend.prior.predict import SHAPE
@@ -74,7 +74,7 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
         source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
         source += draw.normal(0.0, 0.8) * views[0].camera_to_world[:3, 2]
     else:
-        source = meeting_point(clear_depth_at, views, most_frames=FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
+        source = source_point(clear_depth_at, views, most_frames=FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
 
     def depth_at(index: int) -> np.ndarray:
         return filmed(clear_depth_at(index), noise, draw)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from backend.prior.levels import read_level_net
+from backend.prior.levels import LevelNet, read_level_net
 from backend.prior.network import PlumeNet
 from backend.prior.predict import read_net, save_weights
 from backend.prior.sheets import HEIGHT, NUM_LEVELS, NUM_MOMENTS, NUM_PARTS, parts
 from training.level_lessons import draw_clip, write_lessons
-from training.level_train import Clips, main
+from training.level_train import Clips, main, mixed
 from training.library import Plume
 
 
@@ -76,3 +76,12 @@ def test_a_training_leaves_both_networks(folder: Path, tmp_path: Path, capsys: p
     assert read_level_net(tmp_path / "both.npz") is not None
     for ours, theirs in zip(read_net(tmp_path / "both.npz").parameters(), large.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=2e-3, atol=1e-6)
+
+
+def test_weights_that_ship_may_lie_between_those_before_and_those_learned() -> None:
+    start, learned = LevelNet(8), LevelNet(8)
+    half = mixed(start, learned, 0.5)
+    for weight, before, after in zip(half.parameters(), start.parameters(), learned.parameters(), strict=True):
+        torch.testing.assert_close(weight, 0.5 * (before + after))
+    for weight, after in zip(mixed(start, learned, 1.0).parameters(), learned.parameters(), strict=True):
+        torch.testing.assert_close(weight, after)
