@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from backend.field.rays import at_voxels
-from backend.fit.region import Region
+from backend.fit.region import FINER, Region
 from backend.fit.sharpen import ratio_to
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -24,7 +24,7 @@ _UPDATES = 6
 _AS_IT_IS = 1e-3  # weight of a sighting that would leave each voxel as it stands
 _REACH = 15  # strides to either side that count
 _APART = 5  # strides between the moments at which it is found
-_WIDE = 28  # voxels of its grid along x and y: all that the cameras' grids cover but their corners
+_WIDE = 28  # voxels of proposals that its grid is wide along x and y: all that the cameras' grids cover but their corners
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,9 +62,10 @@ class Lasting:
         apart = max(1, round(stride * len(asked) / len(region.depths)))
         self.looked = range(0, len(asked), apart)  # which of those asked
         self.moments = sorted({*(asked[index] for index in self.looked[::_APART]), asked[-1]})
-        shape = _WIDE, _WIDE, SHAPE[2]
-        origin = region.centre - 0.5 * region.voxel_size * (np.array(shape) - 1)
-        self.lattice = Lattice(origin=tuple(origin), voxel_size=region.voxel_size, shape=shape)
+        voxel_size, wide = region.voxel_size / FINER, round(FINER * _WIDE)
+        shape = wide, wide, round(FINER * SHAPE[2])
+        origin = region.centre - 0.5 * voxel_size * (np.array(shape) - 1)
+        self.lattice = Lattice(origin=tuple(origin), voxel_size=voxel_size, shape=shape)
         self.stand = Stand(lattice=self.lattice, from_world=np.eye(4))
         self.found: dict[int, np.ndarray] = {}
 
@@ -78,7 +79,7 @@ class Lasting:
         return self.stand.at(values, stand.centres().reshape(-1, 3), outside="nearest").reshape(stand.lattice.shape)
 
     def _around(self, moment: int) -> np.ndarray:
-        points = self.stand.centres().reshape(-1, 3)
+        points, shown = self.stand.centres().reshape(-1, 3), self.region.finer
         guess, sightings = np.zeros(len(points), np.float32), []
         for index in self.looked:
             frame = self.asked[index]
@@ -87,7 +88,7 @@ class Lasting:
                 continue
             proposal = self.proposal_at(index)
             guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="grid-constant")
-            sightings.append(Sighting(depth=self.region.depths[frame], view=self.region.views[frame], weight=weight))
+            sightings.append(Sighting(depth=shown.depths[frame], view=shown.views[frame], weight=weight))
         total = sum(sighting.weight for sighting in sightings)
         floor = 1e-6 * float(guess.max(initial=0.0))
         return lasting((guess / np.float32(total) + np.float32(floor)).reshape(self.lattice.shape), self.lattice, sightings)

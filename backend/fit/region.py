@@ -1,8 +1,9 @@
-"""The part of the world that the smoke of a clip fills, and the clip's optical depth at the size in which the prior sees it."""
+"""The part of the world that the smoke of a clip fills, and the clip's optical depth at the sizes in which it is looked at."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +15,7 @@ from backend.geometry.camera import View, resized
 
 CELLS_HIGH, CELLS_WIDE = 37.0, 22.0  # voxels that the smoke of the clip should fill at most
 PIXELS_A_CELL = 1.85
+FINER = 1.5  # voxels of what becomes of a proposal, to one of its own; and pixels of what that is compared with
 ROUNDS = 2  # at most, in which the prior then moves the middle
 _MOST_PROBES = 5  # frames that it is asked about in each
 _PROBE_SHARE = 0.25  # of the frames that it is asked about afterwards
@@ -28,15 +30,24 @@ def num_probes(num_asked: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Pictures:
+    """depths [F, h, w] float32: optical depths, made small; views: of them."""
+
+    depths: np.ndarray
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
-    """centre [3] m: the middle of the smoke; source [3] m; voxel_size m; depths [F, h, w] float32: small optical depths;
-    views: of the small images."""
+    """centre [3] m: the middle of the smoke; source [3] m; voxel_size m, of proposals; depths [F, h, w] float32 and views: the
+    pictures that the prior sees; finer: those that are compared with what becomes of its proposals."""
 
     centre: np.ndarray
     source: np.ndarray
     voxel_size: float
     depths: np.ndarray
     views: tuple[View, ...]
+    finer: Pictures
 
 
 def find_region(layers: Series[np.ndarray], scene: Scene) -> Region | None:
@@ -62,16 +73,21 @@ def find_region(layers: Series[np.ndarray], scene: Scene) -> Region | None:
     voxel_size = max((max(heights) - min(heights)) / CELLS_HIGH, float(np.quantile(widths, 0.9)) / CELLS_WIDE)
     view = scene.views[seen[0]]
     pixel = max(float(view.to_camera(scene.anchor[None])[0, 2]), 1e-6) / view.fx
-    share = min(1.0, PIXELS_A_CELL * pixel / voxel_size)
-    size = max(4, round(view.width * share)), max(4, round(view.height * share))
-    small = [cv2.resize(optical_depth(layers[frame]), size, interpolation=cv2.INTER_AREA) for frame in range(len(layers))]
+    pictures = [_small(layers, scene.views, share=min(1.0, fine * PIXELS_A_CELL * pixel / voxel_size)) for fine in (1.0, FINER)]
     return Region(
         centre=centre,
         source=scene.anchor,
         voxel_size=voxel_size,
-        depths=np.stack(small),
-        views=tuple(resized(item, size) for item in scene.views),
+        depths=pictures[0].depths,
+        views=pictures[0].views,
+        finer=pictures[1],
     )
+
+
+def _small(layers: Series[np.ndarray], views: Sequence[View], *, share: float) -> Pictures:
+    size = max(4, round(views[0].width * share)), max(4, round(views[0].height * share))
+    depths = [cv2.resize(optical_depth(layers[frame]), size, interpolation=cv2.INTER_AREA) for frame in range(len(layers))]
+    return Pictures(depths=np.stack(depths), views=tuple(resized(view, size) for view in views))
 
 
 def _box(depth: np.ndarray) -> tuple[float, float, float, float, float] | None:

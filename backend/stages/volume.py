@@ -20,7 +20,7 @@ from backend.fit.guide import Guide
 from backend.fit.lasting import Lasting
 from backend.fit.levelled import Levels
 from backend.fit.pace import gap_of, stride_of
-from backend.fit.region import ROUNDS, Region, find_region, num_probes
+from backend.fit.region import FINER, ROUNDS, Region, find_region, num_probes
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
@@ -33,6 +33,7 @@ from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 _LONGER = 8  # a proposal takes as long as so many records
+_FINE = round(FINER * SHAPE[0]), round(FINER * SHAPE[1]), round(FINER * SHAPE[2])
 _NEAR_ENOUGH = 0.5  # voxels that the middle moves at most in a last round
 
 
@@ -73,19 +74,17 @@ class Plan:
         )
 
     def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
-        """Of a frame behind that of `index` among those asked and not behind the next."""
-        first, last = self.asked[index : index + 2]
-        if frame == last:
-            return after
-        region = self.region
-        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size, shape=SHAPE)
-        return between(before, after, stand, share=(frame - first) / (last - first), seconds=(last - first) * self.seconds)
+        """Of a frame from that of `index` among those asked to the next, on finer voxels."""
+        first, last = self.asked[index], self.asked[min(index + 1, len(self.asked) - 1)]
+        region, apart = self.region, max(last - first, 1)
+        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / FINER, shape=_FINE)
+        return between(before, after, stand, share=(frame - first) / apart, seconds=apart * self.seconds)
 
     def record(self, proposal: Proposal, lasts: np.ndarray, frame: int) -> VolumeRecord:
         """In the clip's own world, as the frame shows it. lasts [X, Y, Z]: on the proposal's voxels."""
         region = self.region
         density = sharpened(proposal.density, lasts)
-        density = agreed(density, proposal.stand, region.depths[frame], region.views[frame])
+        density = agreed(density, proposal.stand, region.finer.depths[frame], region.finer.views[frame])
         return _packed(
             replace(proposal, density=density, velocity=proposal.velocity @ self.straight[:3, :3].astype(np.float32)),
             proposal.stand.from_world @ self.straight,
@@ -155,7 +154,8 @@ def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: 
     words = _levelled(plan, proposals, levels)
     lasts = Lasting(plan.region, words, plan.asked, stride=plan.stride)
     before = after = words(0)
-    yield plan.record(before, lasts.at(before.stand, 0), 0)
+    proposal = plan.amid(before, after, 0, 0)
+    yield plan.record(proposal, lasts.at(proposal.stand, 0), 0)
     for index, last in enumerate(plan.asked[1:]):
         before, after = after, words(index + 1)
         for frame in range(plan.asked[index] + 1, last + 1):

@@ -11,7 +11,7 @@ import torch
 
 from backend.fit import levelled
 from backend.fit.levelled import OWN_ERROR, Levels, moved
-from backend.fit.region import Region
+from backend.fit.region import Pictures, Region
 from backend.geometry.camera import View, view_at
 from backend.prior.levels import NUM_FEATURES, LevelNet, ask, features_of, read_level_net
 from backend.prior.network import PlumeNet
@@ -174,7 +174,8 @@ def region(depth_at: Callable[[int], np.ndarray]) -> Region:
     depths = [depth_at(frame) for frame in range(NUM_FRAMES)]
     views = tuple(view(frame) for frame in range(NUM_FRAMES))
     centre = np.array([0.0, 0.0, 8.0])
-    return Region(depths=depths, views=views, centre=centre, source=SOURCE, voxel_size=VOXEL)  # type: ignore[arg-type]
+    pictures = Pictures(depths=depths, views=views)  # type: ignore[arg-type]
+    return Region(depths=pictures.depths, views=views, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL)
 
 
 def upright_column(at: float) -> Proposal:

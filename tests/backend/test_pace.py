@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from backend.fit.pace import longest_stride, stride_of
-from backend.fit.region import Region
+from backend.fit.region import Pictures, Region
 from backend.geometry.camera import View, view_at
 from synthetic.sweep import Orbit, orbit_cameras
 
@@ -26,7 +26,12 @@ def region(speed: float, views: tuple[View, ...] = VIEWS) -> Region:
     for frame in range(len(views)):
         shift = np.array([[1, 0, 0], [0, 1, -speed / pixel * frame - 100]], np.float32)
         depths.append(cv2.warpAffine(noise, shift, (60, 100)))
-    return Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=np.stack(depths), views=views)
+    return shown(np.stack(depths), views)
+
+
+def shown(depths: np.ndarray, views: tuple[View, ...]) -> Region:
+    pictures = Pictures(depths=depths, views=views)
+    return Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=depths, views=views, finer=pictures)
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.12, 0.3])
@@ -38,10 +43,8 @@ def test_smoke_moves_about_a_voxel_in_a_stride(speed: float) -> None:
 
 def test_what_stands_or_is_not_there_has_the_shortest_stride() -> None:
     still = (VIEWS[0],) * 60
-    empty = Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=np.zeros((60, 100, 60), np.float32), views=still)
-    assert stride_of(empty) == 1
-    one = Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=np.ones((1, 100, 60), np.float32), views=still[:1])
-    assert stride_of(one) == 1
+    assert stride_of(shown(np.zeros((60, 100, 60), np.float32), still)) == 1
+    assert stride_of(shown(np.ones((1, 100, 60), np.float32), still[:1])) == 1
 
 
 @pytest.mark.parametrize(("num_frames", "longest"), [(1, 1), (15, 3), (30, 7), (120, 16)])
