@@ -1,16 +1,20 @@
 """Particles brought to the density of a volume: moved first, then made heavier or lighter; newborn ones at its depth.
 
 What the volume proposes for one frame is right in the mean and blurred; what particles bring along is sharp and drifts.
-Densities are compared on the volume's own voxels, each particle shared among the eight around it.
+Densities are compared on the volume's own voxels, and what has to move on larger ones, each particle shared among the eight
+around it.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from backend.field.lookup import deposited, trilinear
 from backend.field.poisson import weighted_poisson
 from backend.fit.guide import Guide
+from backend.fit.region import FINER
 from backend.geometry.camera import View
 
 FOLLOW_PLACES = 0.8  # share of the flow that turns the particles' density into the volume's, a frame
@@ -24,35 +28,44 @@ class Balance:
     """What the particles at positions [N, 3] m of masses [N] m^2 show in a guide's voxels, against what it proposes."""
 
     def __init__(self, guide: Guide, positions: np.ndarray, masses: np.ndarray) -> None:
-        self.guide = guide
+        self.guide, self.masses = guide, masses
         self.places = guide.stand.voxels(positions)  # [N, 3]
-        volume = guide.lattice.voxel_size**3
-        self.carried = (deposited(self.places, masses, guide.lattice.shape) / volume).astype(np.float32)  # [X, Y, Z] 1/m
-        self.wanted = guide.density
 
     def displacement(self) -> np.ndarray:
         """[N, 3] m: the shortest flow that turns the carried density into the wanted one, both of one total.
 
         First order of optimal transport (Benamou and Brenier 2000): the displacement is a gradient, and the divergence of
-        density times displacement is what there is too much. At most a voxel.
+        density times displacement is what there is too much. At most a larger voxel.
         """
-        total = float(self.wanted.sum(dtype=np.float64))
-        if not total > 0.0 or not self.carried.any():
+        fine = self.guide.density
+        width, depth, height = (math.ceil(size / FINER) for size in fine.shape)
+        voxels = np.moveaxis(np.indices(fine.shape), 0, -1).reshape(-1, 3)
+        wanted = deposited(_larger(voxels), fine.ravel(), (width, depth, height))
+        places = _larger(self.places)
+        carried = deposited(places, self.masses, (width, depth, height))
+        if not wanted.sum() > 0.0 or not carried.any():
             return np.zeros(self.places.shape)
-        wanted = self.wanted * (float(self.carried.sum(dtype=np.float64)) / total)
-        weight = 0.5 * (self.carried + wanted) + _THIN * wanted.max()
-        potential = weighted_poisson(weight, (self.carried - wanted).astype(np.float64))
+        wanted *= carried.sum() / wanted.sum()
+        weight = 0.5 * (carried + wanted) + _THIN * wanted.max()
+        potential = weighted_poisson(weight, carried - wanted)
         steps = np.moveaxis(np.array(np.gradient(potential)), 0, -1)
         steps /= np.maximum(np.linalg.norm(steps, axis=-1, keepdims=True), 1.0)
-        moved = trilinear(steps, self.places, outside="grid-constant")
-        return self.guide.lattice.voxel_size * moved @ self.guide.stand.from_world[:3, :3]
+        moved = trilinear(steps.astype(np.float32), places, outside="grid-constant")
+        return FINER * self.guide.lattice.voxel_size * moved @ self.guide.stand.from_world[:3, :3]
 
     def ratios(self) -> np.ndarray:
         """[N]: how many times its mass the volume asks of each particle, within MOST_RATIO; none more from one voxel beyond the
         outermost on, where a volume says nothing: particles there are not counted, and would grow without end."""
-        floor = _FLOOR * max(float(self.wanted.max(initial=0.0)), 1e-12)
-        more = (self.wanted - self.carried) / (self.carried + floor)
+        wanted, volume = self.guide.density, self.guide.lattice.voxel_size**3
+        carried = (deposited(self.places, self.masses, wanted.shape) / volume).astype(np.float32)
+        floor = _FLOOR * max(float(wanted.max(initial=0.0)), 1e-12)
+        more = (wanted - carried) / (carried + floor)
         return np.clip(1.0 + trilinear(more, self.places, outside="grid-constant"), 1.0 / MOST_RATIO, MOST_RATIO)
+
+
+def _larger(places: np.ndarray) -> np.ndarray:
+    """Places [N, 3] in voxels of a volume -> in voxels that are FINER times as large, of the same grid."""
+    return (places + 0.5) / FINER - 0.5
 
 
 def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:

@@ -50,11 +50,17 @@ class Levels:
         if not weight.any():
             return proposal
         trust = self.share * OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
-        total = ndimage.gaussian_filter1d(weight, _SMOOTH, mode="constant")
-        shift = ndimage.gaussian_filter1d(weight * trust * apart, _SMOOTH, mode="constant") / (total + 1e-6)
+        smooth = _SMOOTH * self._finer(proposal.stand)
+        total = ndimage.gaussian_filter1d(weight, smooth, mode="constant")
+        shift = ndimage.gaussian_filter1d(weight * trust * apart, smooth, mode="constant") / (total + 1e-6)
+        shift *= self._finer(proposal.stand)
         return replace(
             proposal, density=moved(proposal.density, shift), velocity=moved(proposal.velocity, shift, outside="nearest")
         )
+
+    def _finer(self, stand: Stand) -> float:
+        """Voxels of a stand to one of the prior's, in which all lengths here are."""
+        return self.region.voxel_size / stand.lattice.voxel_size
 
     def _apart(self, proposal: Proposal, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of each level [Z]: voxels from where the proposal has its middle to where the small network does, how unsure that is in
@@ -64,7 +70,8 @@ class Levels:
         middle, unsure, asked = self._said(proposal.stand, frame)
         counted = columns * asked
         seen = counted.sum(axis=0)
-        own = np.einsum("xyz,y->z", proposal.density, np.arange(proposal.density.shape[1])) / np.maximum(mass, 1e-12)
+        at = np.arange(proposal.density.shape[1]) / self._finer(proposal.stand)
+        own = np.einsum("xyz,y->z", proposal.density, at) / np.maximum(mass, 1e-12)
         aim = (counted * middle).sum(axis=0) / np.maximum(seen, 1e-12)
         weight = np.where((seen > 0) & (mass > _FAINT * mass.max(initial=0.0)), mass, 0.0)
         return aim - own, unsure, weight / max(float(weight.max(initial=0.0)), 1e-12)
@@ -77,8 +84,9 @@ class Levels:
         later = int(np.clip(np.searchsorted(frames, frame), 1, len(frames) - 1))
         share = np.clip((frame - frames[later - 1]) / max(int(frames[later] - frames[later - 1]), 1), 0.0, 1.0)
         middle, unsure, asked = ((1.0 - share) * values[later - 1] + share * values[later] for values in said)
-        own, source = stand.centres()[0, 0, :, 2], stand.voxels(self.region.source[None])[0]
-        at = (np.arange(stand.lattice.shape[0]) - source[0]) / UNIT
+        finer = self._finer(stand)
+        own, source = stand.centres()[0, 0, :, 2], stand.voxels(self.region.source[None])[0] / finer
+        at = (np.arange(stand.lattice.shape[0]) / finer - source[0]) / UNIT
         across = [np.interp(at, parts(), row) for row in middle]  # of each level [X]
         deep = np.stack([np.interp(own, heights, column) for column in np.transpose(across)])
         return source[1] + UNIT * deep, UNIT * np.interp(own, heights, unsure), np.interp(own, heights, asked)

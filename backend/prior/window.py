@@ -47,8 +47,8 @@ class Stand:
 
     def voxels(self, points: np.ndarray) -> np.ndarray:
         """World points [..., 3] m -> [..., 3] voxels from the first one's centre."""
-        local = points @ self.from_world[:3, :3].T + self.from_world[:3, 3]
-        return (local - np.asarray(self.lattice.origin)) / self.lattice.voxel_size
+        size = self.lattice.voxel_size
+        return points @ (self.from_world[:3, :3].T / size) + (self.from_world[:3, 3] - np.asarray(self.lattice.origin)) / size
 
     def centres(self) -> np.ndarray:
         """[X, Y, Z, 3] m: the voxels' centres in the world."""

@@ -10,17 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 
 from backend.contract.cameras import Cameras
 from backend.fit.between import between
+from backend.fit.closer import closer
 from backend.fit.guide import Guide
 from backend.fit.lasting import Lasting
 from backend.fit.levelled import Levels
 from backend.fit.pace import gap_of, stride_of
-from backend.fit.region import FINER, ROUNDS, Region, find_region, num_probes
+from backend.fit.region import FINER, ROUNDS, Pictures, Region, find_region, num_probes
 from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
@@ -28,7 +30,7 @@ from backend.fit.state import VolumeRecord
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.levels import LevelNet
 from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
-from backend.prior.window import stand_before
+from backend.prior.window import Stand, stand_before
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
@@ -61,24 +63,38 @@ class Plan:
     def proposed(self, prior: Prior, frame: int) -> Proposal:
         """The prior's own word on a frame."""
         region = self.region
+        return self._asked(prior, frame, Pictures(depths=region.depths, views=region.views), region.centre, finer=1.0)
+
+    def refined(self, prior: Prior, frame: int) -> Proposal:
+        """The same on finer voxels, with what the prior sees when it looks closer."""
+        ask = partial(self._asked, prior, frame, self.region.finer, finer=FINER)
+        return closer(self.proposed(prior, frame), self._stand(frame), ask)
+
+    def _asked(self, prior: Prior, frame: int, shown: Pictures, centre: np.ndarray, *, finer: float) -> Proposal:
         return prior.propose(
-            lambda number: region.depths[number],
-            lambda number: region.views[number],
-            region.centre,
-            region.source,
+            lambda number: shown.depths[number],
+            lambda number: shown.views[number],
+            centre,
+            self.region.source,
             frame,
-            voxel_size=region.voxel_size,
-            stride=self.stride,
-            num_frames=len(region.depths),
+            voxel_size=self.region.voxel_size / finer,
+            stride=max(1, round(self.stride / finer)),
+            num_frames=len(shown.depths),
             seconds_per_frame=self.seconds,
         )
 
+    def _stand(self, frame: int) -> Stand:
+        """The finer voxels before the camera of a frame."""
+        region = self.region
+        return stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / FINER, shape=_FINE)
+
     def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
-        """Of a frame from that of `index` among those asked to the next, on finer voxels."""
-        first, last = self.asked[index], self.asked[min(index + 1, len(self.asked) - 1)]
-        region, apart = self.region, max(last - first, 1)
-        stand = stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / FINER, shape=_FINE)
-        return between(before, after, stand, share=(frame - first) / apart, seconds=apart * self.seconds)
+        """Of a frame behind that of `index` among those asked and not behind the next."""
+        first, last = self.asked[index : index + 2]
+        if frame == last:
+            return after
+        share, seconds = (frame - first) / (last - first), (last - first) * self.seconds
+        return between(before, after, self._stand(frame), share=share, seconds=seconds)
 
     def record(self, proposal: Proposal, lasts: np.ndarray, frame: int) -> VolumeRecord:
         """In the clip's own world, as the frame shows it. lasts [X, Y, Z]: on the proposal's voxels."""
@@ -121,7 +137,8 @@ def centred(plan: Plan, report: Report, *, prior: Prior, num_done: int = 0, num_
     for number in range(ROUNDS):
         moment, mass = np.zeros(3), 0.0
         region, done = plan.region, _LONGER * (num_done + count * number)
-        for frame, answer in zip(frames, _answers(plan, report, frames, prior, num_workers, done=done), strict=True):
+        ask = partial(plan.proposed, prior)
+        for frame, answer in zip(frames, _answers(plan, report, frames, ask, num_workers, done=done), strict=True):
             density = agreed(answer.density, answer.stand, region.depths[frame], region.views[frame]).astype(np.float64)
             moment += density.ravel() @ answer.stand.centres().reshape(-1, 3)
             mass += float(density.sum())
@@ -144,7 +161,8 @@ def propose(
 ) -> Iterator[VolumeRecord]:
     """Yields what the prior says of the asked frames behind those that are `done`, in the upright world: each one's own word."""
     num_done = len(done)
-    for answer in _answers(plan, report, plan.asked[num_done:], prior, num_workers, done=_LONGER * (plan.probes + num_done)):
+    ask, done_work = partial(plan.refined, prior), _LONGER * (plan.probes + num_done)
+    for answer in _answers(plan, report, plan.asked[num_done:], ask, num_workers, done=done_work):
         yield _packed(answer, answer.stand.from_world)
 
 
@@ -154,8 +172,7 @@ def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: 
     words = _levelled(plan, proposals, levels)
     lasts = Lasting(plan.region, words, plan.asked, stride=plan.stride)
     before = after = words(0)
-    proposal = plan.amid(before, after, 0, 0)
-    yield plan.record(proposal, lasts.at(proposal.stand, 0), 0)
+    yield plan.record(before, lasts.at(before.stand, 0), 0)
     for index, last in enumerate(plan.asked[1:]):
         before, after = after, words(index + 1)
         for frame in range(plan.asked[index] + 1, last + 1):
@@ -175,15 +192,15 @@ def _levelled(plan: Plan, proposals: Series[VolumeRecord], net: LevelNet | None)
 
 
 def _answers(
-    plan: Plan, report: Report, frames: Sequence[int], prior: Prior, num_workers: int, *, done: int
+    plan: Plan, report: Report, frames: Sequence[int], ask: Callable[[int], Proposal], num_workers: int, *, done: int
 ) -> Iterator[Proposal]:
-    """The prior's own words on some frames, in order. done: steps of the stage's progress before them."""
+    """What the prior says of some frames, in order. done: steps of the stage's progress before them."""
     at_once = min(num_workers or torch.get_num_threads(), _MOST_AT_ONCE)
     with ThreadPoolExecutor(at_once) as pool:
         for first in range(0, len(frames), at_once):
             report.progress(done + _LONGER * first, plan.work)
             with one_thread():
-                answers = list(pool.map(lambda frame: plan.proposed(prior, frame), frames[first : first + at_once]))
+                answers = list(pool.map(ask, frames[first : first + at_once]))
             yield from answers
 
 
