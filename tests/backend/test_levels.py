@@ -178,16 +178,17 @@ def region(depth_at: Callable[[int], np.ndarray]) -> Region:
     return Region(depths=pictures.depths, views=views, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL)
 
 
-def upright_column(at: float) -> Proposal:
-    """Of one width, `at` voxels along the view."""
-    stand = stand_before(view(30), np.array([0.0, 0.0, 8.0]), voxel_size=VOXEL, shape=SHAPE)
-    x, y, _ = np.indices(SHAPE)
+def upright_column(at: float, *, finer: float = 1.0) -> Proposal:
+    """Of one width, `at` of the prior's voxels along the view; on voxels `finer` times as fine."""
+    width, depth, height = (round(finer * size) for size in SHAPE)
+    stand = stand_before(view(30), np.array([0.0, 0.0, 8.0]), voxel_size=VOXEL / finer, shape=(width, depth, height))
+    x, y, _ = (np.indices((width, depth, height)) + 0.5) / finer - 0.5
     density = np.exp(-0.5 * (np.square(x - 12) + np.square(y - at)) / 4).astype(np.float32)
     return Proposal(stand=stand, density=density, velocity=np.stack([density] * 3, axis=-1))
 
 
 def middles(density: np.ndarray) -> np.ndarray:
-    return np.einsum("xyz,y->z", density, np.arange(SHAPE[1])) / density.sum(axis=(0, 1))
+    return np.einsum("xyz,y->z", density, np.arange(density.shape[1])) / density.sum(axis=(0, 1))
 
 
 class Sure(LevelNet):
@@ -214,6 +215,20 @@ def test_levels_go_the_further_the_surer_they_are(unsure: float, least: float, m
     assert (share < most + 1e-3).all()
     assert found.density.sum() == pytest.approx(float(proposal.density.sum()), rel=0.01)
     assert found.density.dtype == found.velocity.dtype == np.float32
+
+
+@pytest.mark.parametrize("finer", [1.0, 1.5, 2.0])
+def test_levels_on_finer_voxels_go_as_far(finer: float) -> None:
+    levels = Levels(region(leaning()), Sure(float(np.log(OWN_ERROR / UNIT))), stride=2)
+    levels.weigh([(upright_column(9.0), 30)])
+    share = levels.share
+    levels.weigh([(upright_column(9.0, finer=finer), 30)])
+    assert levels.share == pytest.approx(share, abs=0.02)
+    before = upright_column(9.0, finer=finer)
+    moves = (middles(levels.levelled(before, 30).density) - middles(before.density)) / finer
+    coarse = upright_column(9.0)
+    wanted = (middles(levels.levelled(coarse, 30).density) - middles(coarse.density))[8:28].mean()
+    np.testing.assert_allclose(moves[round(8 * finer) : round(28 * finer)], wanted, atol=0.05)
 
 
 @pytest.mark.parametrize(("usual", "least", "most"), [(0.7, 0.9, 1.0), (1.0, 0.48, 0.52), (1.5, 0.0, 0.05)])
