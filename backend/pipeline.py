@@ -220,7 +220,7 @@ class Pipeline:
             settings = self.config.volume
             with open_stage_file(self.folder.smoke) as file:
                 layers, cameras = FrameStack(file, "smoke"), read_cameras(self.folder.cameras)
-                plan = volume.make_plan(layers, cameras, stride=settings.stride, every=settings.every)
+                plan = volume.make_plan(layers, cameras, stride=settings.stride, every=settings.every, finer=settings.finer)
             parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
             if plan is None:
                 write_records(self.folder.volume, mark, ())

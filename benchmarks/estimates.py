@@ -76,7 +76,7 @@ def fitted_trials() -> list[Trial]:
     scene = SETS / "steady_plume"
     video, cameras = (str(scene / INPUT_FOLDER / name) for name in (SMOKE_VIDEO, CAMERAS_FILE))
     # Numbers of frames. Of few frames the prior is asked about none or all, of many now and then.
-    for preset, around, still in (("draft", 64, 16), ("preview", 14, 12), ("final", 14, 8)):
+    for preset, around, still in (("draft", 64, 16), ("preview", 40, 12), ("final", 14, 8)):
         found.append(Trial(clip=scene.name, video=video, preset=preset, frames=(40, 40 + around), cameras=cameras))
         found.append(Trial(clip=scene.name, video=video, preset=preset, frames=(40, 40 + still)))
     return found

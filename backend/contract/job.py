@@ -104,11 +104,13 @@ class VolumeConfig:
     use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
     stride: frames between the images that it compares; 0 finds it from the motion.
     every: frames from one that it is asked about to the next, at most two strides; what lies between is carried along.
+    finer: it is asked about parts of the smoke, too, and what becomes of that stands on voxels two thirds as large as its own.
     """
 
     use_prior: bool = True
     stride: int = 0
     every: int = 5
+    finer: bool = True
 
     def __post_init__(self) -> None:
         _check("every", self.every, 1, 16)
@@ -257,6 +259,7 @@ class Config:
 def draft() -> Config:
     """A first look."""
     return Config(
+        volume=VolumeConfig(finer=False),
         physical=PhysicalConfig(num_particles=1000, solver_iterations=2, correction_iterations=2),
         visual=VisualConfig(num_particles=4000, iterations=3),
         published=PublishedConfig(num_physical=1000, num_particles=4000, physical_iterations=6, visual_iterations=6),

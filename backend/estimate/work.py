@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from backend.contract.job import Config
 from backend.estimate.machine import HEIGHT, NUM_PARTICLES, WIDTH
 from backend.fit.pace import gap_of, longest_stride
-from backend.fit.region import ROUNDS, num_probes
+from backend.fit.region import FINER, ROUNDS, num_probes
 from backend.fit.survey import Survey
 
+USUAL_PARTS = 2.5  # of a frame's smoke, that the prior is asked about one by one when it looks closer
 ONE_HUE_SHARE = 0.65  # of the time that three channels take to be drawn and differentiated
 
 
@@ -64,11 +65,12 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
     }
     if asks_prior(config):
         asked = math.ceil(count / gap_of(config.volume.every, stride=longest_stride(count)))
-        asked += ROUNDS * num_probes(asked)
+        looks = asked * (1.0 + USUAL_PARTS * config.volume.finer) + ROUNDS * num_probes(asked)
+        size = FINER**2 if config.volume.finer else 1.0  # of pictures and of what is done to them, for one
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),
-            Term(name="propose", kind="network", amount=asked / max(1, min(threads, 8))),
-            Term(name="frame", kind="pixels", amount=float(count)),
+            Term(name="propose", kind="network", amount=looks / max(1, min(threads, 8))),
+            Term(name="frame", kind="pixels", amount=count * size),
         ]
     terms["physical"] = _physical(seen, config, pixels)
     terms["visual"] = _visual(seen, config, pixels, visual)

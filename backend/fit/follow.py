@@ -14,13 +14,13 @@ import numpy as np
 from backend.field.lookup import deposited, trilinear
 from backend.field.poisson import weighted_poisson
 from backend.fit.guide import Guide
-from backend.fit.region import FINER
 from backend.geometry.camera import View
 
 FOLLOW_PLACES = 0.8  # share of the flow that turns the particles' density into the volume's, a frame
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away
 MOST_RATIO = 4.0  # by which a mass grows or shrinks in a round
+_HIGH = 40  # voxels of the grid on which what has to move is found; a finer volume's are put together
 _ROUNDS = 3  # in which masses follow, a frame
 
 
@@ -38,10 +38,11 @@ class Balance:
         density times displacement is what there is too much. At most a larger voxel.
         """
         fine = self.guide.density
-        width, depth, height = (math.ceil(size / FINER) for size in fine.shape)
+        larger = max(1.0, fine.shape[2] / _HIGH)
+        width, depth, height = (math.ceil(size / larger) for size in fine.shape)
         voxels = np.moveaxis(np.indices(fine.shape), 0, -1).reshape(-1, 3)
-        wanted = deposited(_larger(voxels), fine.ravel(), (width, depth, height))
-        places = _larger(self.places)
+        wanted = deposited((voxels + 0.5) / larger - 0.5, fine.ravel(), (width, depth, height))
+        places = (self.places + 0.5) / larger - 0.5
         carried = deposited(places, self.masses, (width, depth, height))
         if not wanted.sum() > 0.0 or not carried.any():
             return np.zeros(self.places.shape)
@@ -51,7 +52,7 @@ class Balance:
         steps = np.moveaxis(np.array(np.gradient(potential)), 0, -1)
         steps /= np.maximum(np.linalg.norm(steps, axis=-1, keepdims=True), 1.0)
         moved = trilinear(steps.astype(np.float32), places, outside="grid-constant")
-        return FINER * self.guide.lattice.voxel_size * moved @ self.guide.stand.from_world[:3, :3]
+        return larger * self.guide.lattice.voxel_size * moved @ self.guide.stand.from_world[:3, :3]
 
     def ratios(self) -> np.ndarray:
         """[N]: how many times its mass the volume asks of each particle, within MOST_RATIO; none more from one voxel beyond the
@@ -61,11 +62,6 @@ class Balance:
         floor = _FLOOR * max(float(wanted.max(initial=0.0)), 1e-12)
         more = (wanted - carried) / (carried + floor)
         return np.clip(1.0 + trilinear(more, self.places, outside="grid-constant"), 1.0 / MOST_RATIO, MOST_RATIO)
-
-
-def _larger(places: np.ndarray) -> np.ndarray:
-    """Places [N, 3] in voxels of a volume -> in voxels that are FINER times as large, of the same grid."""
-    return (places + 0.5) / FINER - 0.5
 
 
 def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:

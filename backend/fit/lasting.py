@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from backend.field.rays import at_voxels
-from backend.fit.region import FINER, Region
+from backend.fit.region import Region
 from backend.fit.sharpen import ratio_to
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
@@ -62,8 +62,8 @@ class Lasting:
         apart = max(1, round(stride * len(asked) / len(region.depths)))
         self.looked = range(0, len(asked), apart)  # which of those asked
         self.moments = sorted({*(asked[index] for index in self.looked[::_APART]), asked[-1]})
-        voxel_size, wide = region.voxel_size / FINER, round(FINER * _WIDE)
-        shape = wide, wide, round(FINER * SHAPE[2])
+        voxel_size, wide = region.voxel_size / region.fineness, round(region.fineness * _WIDE)
+        shape = wide, wide, round(region.fineness * SHAPE[2])
         origin = region.centre - 0.5 * voxel_size * (np.array(shape) - 1)
         self.lattice = Lattice(origin=tuple(origin), voxel_size=voxel_size, shape=shape)
         self.stand = Stand(lattice=self.lattice, from_world=np.eye(4))

@@ -40,17 +40,19 @@ class Pictures:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
     """centre [3] m: the middle of the smoke; source [3] m; voxel_size m, of proposals; depths [F, h, w] float32 and views: the
-    pictures that the prior sees; finer: those that are compared with what becomes of its proposals."""
+    pictures that the prior sees; fineness: voxels of what becomes of its proposals, to one of their own; finer: the pictures
+    that this is compared with."""
 
     centre: np.ndarray
     source: np.ndarray
     voxel_size: float
     depths: np.ndarray
     views: tuple[View, ...]
+    fineness: float
     finer: Pictures
 
 
-def find_region(layers: Series[np.ndarray], scene: Scene) -> Region | None:
+def find_region(layers: Series[np.ndarray], scene: Scene, *, fineness: float = FINER) -> Region | None:
     """Where the smoke of all frames together is, at the distance of its source; None where no frame shows any."""
     boxes = [_box(optical_depth(layers[frame])) for frame in range(len(layers))]
     seen = [frame for frame, box in enumerate(boxes) if box is not None]
@@ -73,14 +75,16 @@ def find_region(layers: Series[np.ndarray], scene: Scene) -> Region | None:
     voxel_size = max((max(heights) - min(heights)) / CELLS_HIGH, float(np.quantile(widths, 0.9)) / CELLS_WIDE)
     view = scene.views[seen[0]]
     pixel = max(float(view.to_camera(scene.anchor[None])[0, 2]), 1e-6) / view.fx
-    pictures = [_small(layers, scene.views, share=min(1.0, fine * PIXELS_A_CELL * pixel / voxel_size)) for fine in (1.0, FINER)]
+    shares = [min(1.0, fine * PIXELS_A_CELL * pixel / voxel_size) for fine in (1.0, fineness)]
+    pictures = {share: _small(layers, scene.views, share=share) for share in {*shares}}
     return Region(
         centre=centre,
         source=scene.anchor,
         voxel_size=voxel_size,
-        depths=pictures[0].depths,
-        views=pictures[0].views,
-        finer=pictures[1],
+        depths=pictures[shares[0]].depths,
+        views=pictures[shares[0]].views,
+        fineness=fineness,
+        finer=pictures[shares[1]],
     )
 
 

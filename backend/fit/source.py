@@ -3,7 +3,7 @@
 A source stands still, and at it smoke is fresh: dense and narrow. All that has left it drifts, spreads and thins. So a source is
 the point that stands out from what is around it in the mean over the frames, wherever the camera was. The foot of the smoke in
 the picture says roughly how far away that is; but what wind carries towards the camera sinks below the source in the picture,
-and so the foot is not asked for more.
+and so the foot is not asked for more, but where its word is all there is: of a short clip behind the end of a source.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ _SOURCES = 8  # at most
 _NEARLY = 0.8  # of what stands out most: what does as much is another source
 _APART = 12 / 128  # of the smoke's extent: sources that are nearer are one
 _HALF = 0.5  # of the smoke at a source: the foot is where there is less below it
+_TOO_HIGH = 0.1  # of the distance, above the foot of all smoke: what stands out there has left a source that is out
 _CLIMBS = 9
 _DOWN = 0.1  # of the distance, that it is looked for below
 _ROW = 1024  # points looked up in a row: OpenCV's pictures are not longer than 32767
@@ -74,8 +75,11 @@ def source_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], *
     if not found or max(weights) <= 0.0:
         return rough
     most = np.array(weights) > _NEARLY * max(weights)
-    feet = [seen.foot(point, up_of(views)) for point, is_one in zip(found, most, strict=True) if is_one]
-    return np.average(feet, axis=0, weights=np.array(weights)[most])
+    up = up_of(views)
+    feet = [seen.foot(point, up) for point, is_one in zip(found, most, strict=True) if is_one]
+    middle = np.average(feet, axis=0, weights=np.array(weights)[most])
+    is_smoke_that_left = (middle - rough) @ up > _TOO_HIGH * np.linalg.norm(rough - views[0].position)
+    return rough if is_smoke_that_left else middle
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,6 @@ from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
 _LONGER = 8  # a proposal takes as long as so many records
-_FINE = round(FINER * SHAPE[0]), round(FINER * SHAPE[1]), round(FINER * SHAPE[2])
 _NEAR_ENOUGH = 0.5  # voxels that the middle moves at most in a last round
 
 
@@ -66,9 +65,11 @@ class Plan:
         return self._asked(prior, frame, Pictures(depths=region.depths, views=region.views), region.centre, finer=1.0)
 
     def refined(self, prior: Prior, frame: int) -> Proposal:
-        """The same on finer voxels, with what the prior sees when it looks closer."""
-        ask = partial(self._asked, prior, frame, self.region.finer, finer=FINER)
-        return closer(self.proposed(prior, frame), self._stand(frame), ask)
+        """The same, where wanted on finer voxels with what the prior sees when it looks closer."""
+        proposal, fineness = self.proposed(prior, frame), self.region.fineness
+        if fineness == 1.0:
+            return proposal
+        return closer(proposal, self._stand(frame), partial(self._asked, prior, frame, self.region.finer, finer=fineness))
 
     def _asked(self, prior: Prior, frame: int, shown: Pictures, centre: np.ndarray, *, finer: float) -> Proposal:
         return prior.propose(
@@ -84,9 +85,10 @@ class Plan:
         )
 
     def _stand(self, frame: int) -> Stand:
-        """The finer voxels before the camera of a frame."""
-        region = self.region
-        return stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / FINER, shape=_FINE)
+        """The voxels before the camera of a frame on which its record stands."""
+        region, fineness = self.region, self.region.fineness
+        shape = round(fineness * SHAPE[0]), round(fineness * SHAPE[1]), round(fineness * SHAPE[2])
+        return stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / fineness, shape=shape)
 
     def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
         """Of a frame behind that of `index` among those asked and not behind the next."""
@@ -107,17 +109,20 @@ class Plan:
         )
 
 
-def make_plan(layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, every: int = 1) -> Plan | None:
+def make_plan(
+    layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, every: int = 1, finer: bool = True
+) -> Plan | None:
     """None of a clip without smoke. layers: [H, W, 4] float32 premultiplied linear RGB and opacity.
 
     stride: frames between the images that are compared; 0: found from the motion. every: frames, at most two strides: the prior
-    is asked so often. The prior knows upright worlds only: the scene is turned upright before it is asked, its answer back.
+    is asked so often. finer: on finer voxels than the prior's, looked at closer. The prior knows upright worlds only: the scene
+    is turned upright before it is asked, its answer back.
     """
     scene = make_scene(layers, cameras)
     straight = upright(up_of(scene.views))
     anchor = straight[:3, :3] @ scene.anchor
     scene = replace(scene, views=tuple(turned(view, straight) for view in scene.views), anchor=anchor)
-    region = find_region(layers, scene)
+    region = find_region(layers, scene, fineness=FINER if finer else 1.0)
     if region is None:
         return None
     stride, last = stride or stride_of(region), len(layers) - 1

@@ -62,9 +62,11 @@ def test_density_is_the_proposals_own() -> None:
     assert fine == pytest.approx(coarse, rel=0.01)
 
 
-@pytest.mark.parametrize(("size", "most"), [((0.5, 0.5, 0.5), 1), ((0.8, 0.8, 4.0), 2), ((3.0, 0.8, 4.0), 4), ((0.8, 3.0, 1.0), 1)])
+@pytest.mark.parametrize(
+    ("size", "most"), [((0.5, 0.5, 0.5), 1), ((0.8, 0.8, 4.0), 2), ((3.0, 0.8, 4.0), 4), ((0.8, 3.0, 1.0), 1)]
+)
 def test_few_parts_hold_the_smoke(size: tuple[float, float, float], most: int) -> None:
-    proposal = saying(COARSE, MIDDLE + (0.0, 0.0, -0.7), np.array(size), SLOW)
+    proposal = saying(COARSE, MIDDLE - 0.7 * np.eye(3)[2], np.array(size), SLOW)
     ask, said = asked(FAST)
     closer(proposal, FINE, ask)
     assert 1 <= len(said) <= most

@@ -7,7 +7,6 @@ import pytest
 
 from backend.fit.follow import MOST_RATIO, Balance, drawn_level, points_on_rays
 from backend.fit.guide import Guide
-from backend.fit.region import FINER
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.window import stand_before
@@ -71,7 +70,7 @@ def test_particles_flow_to_where_the_volume_is(shift: tuple[float, float, float]
     masses = np.full(len(points), 1.0 / len(points))
     first = Balance(guide, points, masses).displacement()
     assert np.linalg.norm(first.mean(axis=0) - shift) < 0.4 * np.linalg.norm(shift)
-    assert np.linalg.norm(first, axis=1).max() <= FINER * 0.5 + 1e-6
+    assert np.linalg.norm(first, axis=1).max() <= 0.5 + 1e-6
     for _ in range(8):
         points = points + 0.5 * Balance(guide, points, masses).displacement()
     assert np.linalg.norm(points.mean(axis=0) - MIDDLE - shift) < 0.1 * np.linalg.norm(shift)

@@ -175,7 +175,9 @@ def region(depth_at: Callable[[int], np.ndarray]) -> Region:
     views = tuple(view(frame) for frame in range(NUM_FRAMES))
     centre = np.array([0.0, 0.0, 8.0])
     pictures = Pictures(depths=depths, views=views)  # type: ignore[arg-type]
-    return Region(depths=pictures.depths, views=views, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL)
+    return Region(
+        depths=pictures.depths, views=views, fineness=1.0, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL
+    )
 
 
 def upright_column(at: float, *, finer: float = 1.0) -> Proposal:

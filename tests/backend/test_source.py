@@ -50,6 +50,16 @@ def layer_of(depth: np.ndarray) -> np.ndarray:
     return np.dstack([0.4 * opacity] * 3 + [opacity]).astype(np.float32)
 
 
+def test_smoke_that_has_left_a_source_for_long_is_none() -> None:
+    """A dense puff stands still high above where the rest has risen from: the foot of it all counts."""
+    low, high = (0.7, -0.9, 2.0), (2.0, 1.5, 9.0)
+    rising, standing = film([low], np.zeros(2)), film([high], np.array([0.0, 0.0]), out_at=np.inf)
+    depths = [0.2 * some + 3.0 * more for some, more in zip(rising, standing, strict=True)]
+    found = source_point(depths.__getitem__, VIEWS)
+    np.testing.assert_array_equal(found, foot_point(depths.__getitem__, VIEWS, most_frames=NUM_FRAMES))
+    assert np.linalg.norm(source_point(standing.__getitem__, VIEWS)[:2] - high[:2]) < 0.3, "alone it is a source"
+
+
 @pytest.mark.parametrize("wind", [0.0, 1.0])
 @pytest.mark.parametrize("out_at", [np.inf, 2.0])
 def test_the_source_is_found_where_smoke_drifts_and_where_it_goes_out(wind: float, out_at: float) -> None:

@@ -16,6 +16,7 @@ from backend.contract.cameras import Cameras
 from backend.field.rays import optical_depth
 from backend.fit.between import between
 from backend.fit.guide import Guide
+from backend.fit.region import FINER
 from backend.fit.scene import make_scene, turned_about
 from backend.fit.sharpen import SHARPNESS, sharpened
 from backend.fit.state import VolumeRecord
@@ -101,6 +102,19 @@ def test_it_goes_on_behind_what_is_done(prior: Prior, every: int, num_done: int)
     for a, b in zip(whole[num_done:], rest, strict=True):
         assert a.density.tobytes() == b.density.tobytes()
         assert a.velocity.tobytes() == b.velocity.tobytes()
+
+
+@pytest.mark.parametrize(("finer", "fineness"), [(False, 1.0), (True, FINER)])
+def test_records_are_as_fine_as_wanted(prior: Prior, finer: bool, fineness: float) -> None:
+    plan = volume.make_plan(layers(), CAMERAS, every=2, stride=16, finer=finer)
+    assert plan is not None
+    proposals = list(volume.propose(plan, SilentReport(), prior=prior, done=[]))
+    records = list(volume.run(plan, SilentReport(), proposals, levels=prior.levels))
+    assert len(records) == NUM_FRAMES
+    for record in [*proposals, *records]:
+        assert record.density.shape == tuple(round(fineness * size) for size in SHAPE)
+        assert float(record.voxel_size) == pytest.approx(plan.region.voxel_size / fineness)
+    assert finer == (plan.region.finer.depths.shape != plan.region.depths.shape)
 
 
 def test_the_first_and_the_last_frame_are_asked_and_never_more_than_two_strides_apart() -> None:
