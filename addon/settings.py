@@ -131,6 +131,11 @@ class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
         min=1,
         max=16,
     )
+    finer: BoolProperty(
+        name="Finer",
+        description="Ask it about parts of the smoke, too, and keep what becomes of that on finer voxels; takes longer",
+        default=True,
+    )
 
 
 class WILDSMOKE_PG_physical(bpy.types.PropertyGroup):

@@ -123,7 +123,7 @@ def test_volumes_are_kept_in_half_precision_and_told_to_the_fit(job: Path, plain
         frame = file["000003"]
         assert frame["density"].dtype == frame["velocity"].dtype == np.float16
         assert np.abs(frame["density"][()]).max() == np.abs(frame["velocity"][()]).max() == 1.0
-    assert (job / "stages" / "volume.h5").stat().st_size < 1.1 * NUM_FRAMES * 24 * 24 * 40 * 4 * 2
+    assert (job / "stages" / "volume.h5").stat().st_size < 1.1 * NUM_FRAMES * 36 * 36 * 60 * 4 * 2
     with read_particles(job / "particles.h5") as asked, read_particles(plain / "particles.h5") as unasked:
         assert asked.info.provenance["prior_fingerprint"] == weights_fingerprint(weights)
         assert "prior_fingerprint" not in unasked.info.provenance
