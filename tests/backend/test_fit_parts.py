@@ -15,6 +15,7 @@ from backend.field.rays import optical_depth as optical_depth_of
 from backend.fit import depth_prior, explain, image_motion
 from backend.fit.appearance import Appearance
 from backend.fit.depths import Depths
+from backend.fit.foot import foot_point
 from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import make_scene, optical_depth
@@ -185,6 +186,67 @@ def test_refinement_lowers_the_error_and_stands_nothing_at_all() -> None:
     nobody, loss = refine(appearance.empty(), layer, scene.views[0], iterations=3, reference_scale=1.0)
     assert len(nobody.positions) == 0
     assert math.isfinite(loss)
+
+
+def foot_of(layers: list[np.ndarray], given: Cameras) -> np.ndarray:
+    """[3] m, of smoke layers."""
+    views = [view_at(given, frame) for frame in range(len(layers))]
+    return foot_point(lambda frame: optical_depth(layers[frame]), views)
+
+
+@pytest.mark.parametrize("goes_out_at", [9, 5])
+def test_rays_through_the_foot_of_the_smoke_meet_at_its_source(goes_out_at: int) -> None:
+    """Also where the source goes out and what is left of the smoke drifts away."""
+    source = np.array([0.4, -0.3, 0.0])
+    angles = np.radians(np.linspace(-105, -45, 9))
+    matrices = tuple(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 1.0])) for a in angles)
+    given = cameras(matrices=matrices)
+    layers = []
+    for index in range(len(matrices)):
+        tau = np.zeros((96, 96), np.float32)
+        for height, drift in zip(np.linspace(0, 1.5, 12), np.linspace(0, 0.6, 12), strict=True):
+            if index >= goes_out_at and height < 0.7:
+                continue
+            gone = 0.3 * max(0, index - goes_out_at + 1)
+            pixel = view_at(given, index).project(source[None] + [[drift + gone, 0, height]])[0][0]
+            tau += 0.3 * disc(4.0 + 3 * height, tuple(pixel))
+        layers.append(layer_of(tau))
+    np.testing.assert_allclose(foot_of(layers, given), source, atol=0.25)
+    np.testing.assert_allclose(make_scene(layers[:1], cameras()).anchor, 0.0, atol=1e-9)
+
+
+def on_an_arc(degrees: float) -> tuple[np.ndarray, ...]:
+    """Nine poses [4, 4] of a camera that goes around the world's origin and looks above it."""
+    angles = np.radians(np.linspace(-90 - 0.5 * degrees, -90 + 0.5 * degrees, 9))
+    return tuple(np.array(look_at(np.array([10 * math.cos(a), 10 * math.sin(a), 2.0]), np.array([0, 0, 3.0]))) for a in angles)
+
+
+def plume_from(source: np.ndarray, poses: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """The smoke layers in which a foot stands at `source` [3] m, with more smoke over it."""
+    feet = [view_at(cameras(matrices=(pose,)), 0).project(source[None])[0][0] for pose in poses]
+    return [layer_of(disc(3.0, tuple(pixel)) + disc(9.0, (pixel[0], pixel[1] - 14))) for pixel in feet]
+
+
+@pytest.mark.parametrize("degrees", [0.5, 8.0, 20.0])
+def test_a_camera_that_turns_little_finds_the_source_on_its_ray(degrees: float) -> None:
+    """Not at the height that the camera looks at; as far away as the rays and the world's origin say together."""
+    source, poses = np.array([0.4, -0.3, 0.0]), on_an_arc(degrees)
+    given = cameras(matrices=poses)
+    foot = foot_of(plume_from(source, poses), given)
+    seen, wanted = (view_at(given, 4).project(point[None])[0][0] for point in (foot, source))
+    assert np.linalg.norm(seen - wanted) < 3.5  # px; the foot is not all in the lowest row
+    assert np.linalg.norm(foot - source) < 0.5
+
+
+def test_rays_refute_a_world_that_begins_elsewhere() -> None:
+    source, poses = np.array([0.4, -0.3, 0.0]), on_an_arc(50.0)
+    layers = plume_from(source, poses)
+    expected = foot_of(layers, cameras(matrices=poses))
+    for away in ([0.0, 25.0, 0.0], [0.0, -7.0, 0.0], [3e5, 1e6, -2e5]):
+        shift = np.eye(4)
+        shift[:3, 3] = np.negative(away)
+        foot = foot_of(layers, cameras(matrices=tuple(shift @ pose for pose in poses))) + away
+        np.testing.assert_allclose(foot, expected, atol=0.25)
 
 
 def test_records_take_and_join() -> None:

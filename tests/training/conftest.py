@@ -15,11 +15,12 @@ SHAPE_OF_PLUME = tuple(round(size / VOXEL_SIZE) for size in SIZE)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A column of smoke that leans and rises, as the library keeps plumes."""
+    """A column of smoke that leans, rises and spreads from where it is dense and narrow, as the library keeps plumes."""
     path = tmp_path_factory.mktemp("plumes") / "0003"
     path.mkdir()
     x, y, z = np.meshgrid(*(np.arange(size) for size in SHAPE_OF_PLUME), indexing="ij")
-    column = 120 * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / 12)
+    spread = 1 + z / 20
+    column = 120 / spread * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / (12 * spread))
     density = np.stack([column * (z < 15 + 0.3 * frame) for frame in range(NUM_FRAMES)]).astype(np.uint8)
     shape = (NUM_FRAMES // VELOCITY_EVERY, *SHAPE_OF_PLUME, 3)
     np.save(path / "density.npy", density)

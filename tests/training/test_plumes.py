@@ -46,7 +46,7 @@ def test_what_is_known_of_smoke_is_in_metres(recorded: Plume) -> None:
     assert a is not None and b is not None
     mass = np.square(b["mass"] / 255.0)
     off = np.abs(a["middle"].astype(float) - b["middle"])[mass > 0.2 * mass.max()]
-    assert np.median(off) < 0.15, "units of five voxels"
+    assert np.median(off) < 0.1, "units of five voxels"
 
 
 def test_later_plumes_have_more_sources_that_light_up_while_they_are_filmed() -> None:
