@@ -193,6 +193,7 @@ def main(arguments: list[str]) -> int:
             taught = sums / since
             line = {
                 "steps": step + 1,
+                "rate": given.rate,
                 "taught": [round(UNIT * taught[0].item() ** 0.5, 4), round(taught[3].item(), 4)],
                 **score(mixed(start, mean, given.share), unseen),
             }

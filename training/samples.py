@@ -14,8 +14,7 @@ from backend.fit.region import CELLS_HIGH, CELLS_WIDE, PIXELS_A_CELL
 from backend.fit.source import source_point
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
-from backend.prior.predict import SHAPE
-from backend.prior.window import Stand, Window, look, stand_before
+from backend.prior.window import SHAPE, Stand, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 

@@ -25,8 +25,8 @@ from torch.nn import functional
 from backend.io.atomic import whole_file
 from backend.prior.levels import read_level_net
 from backend.prior.network import PlumeNet, Sight
-from backend.prior.predict import SHAPE, read_weights, save_weights
-from backend.prior.window import NUM_CONDITIONS, OFFSETS
+from backend.prior.predict import read_weights, save_weights
+from backend.prior.window import NUM_CONDITIONS, OFFSETS, SHAPE
 from backend.score.measures import correlation
 
 _HELD_BACK = 10  # every such plume

@@ -65,8 +65,8 @@ def terms_of(seen: Survey, config: Config, *, threads: int) -> dict[str, list[Te
     }
     if asks_prior(config):
         asked = math.ceil(count / gap_of(config.volume.every, stride=longest_stride(count)))
-        looks = asked * (1.0 + USUAL_PARTS * config.volume.finer) + ROUNDS * num_probes(asked)
-        size = FINER**2 if config.volume.finer else 1.0  # of pictures and of what is done to them, for one
+        parts, size = (USUAL_PARTS, FINER**2) if config.volume.finer else (0.0, 1.0)  # size: of pictures, for one
+        looks = asked * (1.0 + parts) + ROUNDS * num_probes(asked)
         terms["volume"] = [
             Term(name="load", kind="pixels", amount=1.0),
             Term(name="propose", kind="network", amount=looks / max(1, min(threads, 8))),

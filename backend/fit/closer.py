@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from backend.prior.predict import SHAPE, Proposal
-from backend.prior.window import Stand
+from backend.prior.predict import Proposal
+from backend.prior.window import SHAPE, Stand
 
 TRUST = 0.5  # how much what is seen closer counts; both are a little wrong in ways of their own
 _LEAST = 0.01  # of the fullest level: where smoke ends
@@ -61,8 +61,7 @@ def _middles(proposal: Proposal, *, share: float) -> list[np.ndarray]:
         part = density[:, :, low:top]
         y = 0.5 * sum(_ends(part.sum(axis=(0, 2))))
         found += [np.array([x, y, z]) for x in _cover(*_ends(part.sum(axis=(1, 2))), wide)]
-    local = np.asarray(stand.lattice.origin) + stand.lattice.voxel_size * np.array(found).reshape(-1, 3)
-    return list((local - stand.from_world[:3, 3]) @ stand.from_world[:3, :3])
+    return list(stand.points(np.array(found).reshape(-1, 3)))
 
 
 def _ends(amounts: np.ndarray) -> tuple[float, float]:

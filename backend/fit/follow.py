@@ -1,8 +1,8 @@
 """Particles brought to the density of a volume: moved first, then made heavier or lighter; newborn ones at its depth.
 
 What the volume proposes for one frame is right in the mean and blurred; what particles bring along is sharp and drifts.
-Densities are compared on the volume's own voxels, and what has to move on larger ones, each particle shared among the eight
-around it.
+Densities are compared on the volume's own voxels, each particle shared among the eight around it; what has to move, on voxels as
+large as the prior's.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from backend.field.lookup import deposited, trilinear
 from backend.field.poisson import weighted_poisson
 from backend.fit.guide import Guide
 from backend.geometry.camera import View
+from backend.prior.window import SHAPE
 
 FOLLOW_PLACES = 0.8  # share of the flow that turns the particles' density into the volume's, a frame
 _FLOOR = 0.02  # of the volume's largest density, added to both sides of a ratio
 _THIN = 0.02  # of the largest density, added everywhere: what is next to empty does not fly away
 MOST_RATIO = 4.0  # by which a mass grows or shrinks in a round
-_HIGH = 40  # voxels of the grid on which what has to move is found; a finer volume's are put together
 _ROUNDS = 3  # in which masses follow, a frame
 
 
@@ -38,11 +38,12 @@ class Balance:
         density times displacement is what there is too much. At most a larger voxel.
         """
         fine = self.guide.density
-        larger = max(1.0, fine.shape[2] / _HIGH)
+        larger = max(1.0, fine.shape[2] / SHAPE[2])
         width, depth, height = (math.ceil(size / larger) for size in fine.shape)
-        voxels = np.moveaxis(np.indices(fine.shape), 0, -1).reshape(-1, 3)
-        wanted = deposited((voxels + 0.5) / larger - 0.5, fine.ravel(), (width, depth, height))
-        places = (self.places + 0.5) / larger - 0.5
+        voxels, places = (
+            (at + 0.5) / larger - 0.5 for at in (np.moveaxis(np.indices(fine.shape), 0, -1).reshape(-1, 3), self.places)
+        )
+        wanted = deposited(voxels, fine.ravel(), (width, depth, height))
         carried = deposited(places, self.masses, (width, depth, height))
         if not wanted.sum() > 0.0 or not carried.any():
             return np.zeros(self.places.shape)

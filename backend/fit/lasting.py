@@ -17,8 +17,8 @@ from backend.fit.region import Region
 from backend.fit.sharpen import ratio_to
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
-from backend.prior.predict import SHAPE, Proposal
-from backend.prior.window import Stand
+from backend.prior.predict import Proposal
+from backend.prior.window import SHAPE, Stand
 
 _UPDATES = 6
 _AS_IT_IS = 1e-3  # weight of a sighting that would leave each voxel as it stands
@@ -59,13 +59,12 @@ class Lasting:
     def __init__(self, region: Region, proposal_at: Callable[[int], Proposal], asked: Sequence[int], *, stride: int) -> None:
         """proposal_at: index in `asked`, the frames of proposals -> proposal, as often as wanted. stride: frames."""
         self.region, self.proposal_at, self.asked, self.stride = region, proposal_at, asked, stride
-        apart = max(1, round(stride * len(asked) / len(region.depths)))
+        apart = max(1, round(stride * len(asked) / region.num_frames))
         self.looked = range(0, len(asked), apart)  # which of those asked
         self.moments = sorted({*(asked[index] for index in self.looked[::_APART]), asked[-1]})
-        voxel_size, wide = region.voxel_size / region.fineness, round(region.fineness * _WIDE)
-        shape = wide, wide, round(region.fineness * SHAPE[2])
-        origin = region.centre - 0.5 * voxel_size * (np.array(shape) - 1)
-        self.lattice = Lattice(origin=tuple(origin), voxel_size=voxel_size, shape=shape)
+        shape = region.finely((_WIDE, _WIDE, SHAPE[2]))
+        origin = region.centre - 0.5 * region.finer_size * (np.array(shape) - 1)
+        self.lattice = Lattice(origin=tuple(origin), voxel_size=region.finer_size, shape=shape)
         self.stand = Stand(lattice=self.lattice, from_world=np.eye(4))
         self.found: dict[int, np.ndarray] = {}
 
@@ -79,7 +78,7 @@ class Lasting:
         return self.stand.at(values, stand.centres().reshape(-1, 3), outside="nearest").reshape(stand.lattice.shape)
 
     def _around(self, moment: int) -> np.ndarray:
-        points, shown = self.stand.centres().reshape(-1, 3), self.region.finer
+        points = self.stand.centres().reshape(-1, 3)
         guess, sightings = np.zeros(len(points), np.float32), []
         for index in self.looked:
             frame = self.asked[index]
@@ -88,7 +87,8 @@ class Lasting:
                 continue
             proposal = self.proposal_at(index)
             guess += np.float32(weight) * proposal.stand.at(proposal.density, points, outside="grid-constant")
-            sightings.append(Sighting(depth=shown.depths[frame], view=shown.views[frame], weight=weight))
+            depth, view = self.region.finer.of(frame)
+            sightings.append(Sighting(depth=depth, view=view, weight=weight))
         total = sum(sighting.weight for sighting in sightings)
         floor = 1e-6 * float(guess.max(initial=0.0))
         return lasting((guess / np.float32(total) + np.float32(floor)).reshape(self.lattice.shape), self.lattice, sightings)

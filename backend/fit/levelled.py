@@ -79,7 +79,7 @@ class Levels:
     def _said(self, stand: Stand, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For the grid of a frame: where the middle of each column's smoke is [X, Z] voxels, of each level how unsure that is [Z]
         voxels, and whether the level was asked [Z], from 0 to 1."""
-        frames = moments_around(frame, stride=self.stride, num_frames=len(self.region.depths))
+        frames = moments_around(frame, stride=self.stride, num_frames=self.region.num_frames)
         heights, *said = self._heard(frames)
         later = int(np.clip(np.searchsorted(frames, frame), 1, len(frames) - 1))
         share = np.clip((frame - frames[later - 1]) / max(int(frames[later] - frames[later - 1]), 1), 0.0, 1.0)
@@ -97,8 +97,8 @@ class Levels:
         if key not in self.known:
             region = self.region
             sheets = look_at_sheets(
-                lambda number: region.depths[number],
-                lambda number: region.views[number],
+                lambda number: region.pictures.depths[number],
+                lambda number: region.pictures.views[number],
                 region.source,
                 frames,
                 height=float(region.centre[2]),

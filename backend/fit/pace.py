@@ -20,7 +20,7 @@ def stride_of(region: Region) -> int:
     metres = _metres_a_frame(region)
     if metres <= 0.0:
         return 1
-    return int(np.clip(round(STEP * region.voxel_size / metres), 1, longest_stride(len(region.depths))))
+    return int(np.clip(round(STEP * region.voxel_size / metres), 1, longest_stride(region.num_frames)))
 
 
 def longest_stride(num_frames: int) -> int:
@@ -35,7 +35,7 @@ def gap_of(every: int, *, stride: int) -> int:
 
 def _metres_a_frame(region: Region) -> float:
     """Median over smoke of how far it moves across the image, the camera's own motion taken out at the source's distance."""
-    count, gap, pixels = len(region.depths), 1, 0.0
+    count, gap, pixels = region.num_frames, 1, 0.0
     while gap < count and gap <= _LONGEST:
         firsts = np.linspace(0, count - 1 - gap, _PAIRS).astype(int)
         steps = np.concatenate([_moved(region, int(first), gap) for first in firsts])
@@ -46,13 +46,13 @@ def _metres_a_frame(region: Region) -> float:
         if pixels * gap >= _CLEAR:
             break
         gap *= 2
-    view = region.views[0]
+    view = region.pictures.views[0]
     return pixels * float(view.to_camera(region.source[None])[0, 2]) / view.fx
 
 
 def _moved(region: Region, first: int, gap: int) -> np.ndarray:
     """[N, 2]: how far smoke moved in px, and how much of it there is."""
-    before, after = region.depths[first], region.depths[first + gap]
+    (before, view), (after, later) = region.pictures.of(first), region.pictures.of(first + gap)
     scale = max(float(before.max(initial=0.0)), float(after.max(initial=0.0)), 1e-6)
     coded = [np.rint(255 * np.sqrt(depth / scale)).astype(np.uint8) for depth in (before, after)]
     if min(before.shape) < 16:
@@ -60,8 +60,7 @@ def _moved(region: Region, first: int, gap: int) -> np.ndarray:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(coded[0], coded[1], None)  # type: ignore[call-overload]
     rows, columns = np.nonzero(before > 0.05 * scale)
     pixels = np.stack([columns, rows], axis=1) + 0.5
-    views = region.views[first], region.views[first + gap]
-    depth = float(views[0].to_camera(region.source[None])[0, 2])
-    still, _ = views[1].project(views[0].unproject(pixels, np.full(len(pixels), depth)))
+    depth = float(view.to_camera(region.source[None])[0, 2])
+    still, _ = later.project(view.unproject(pixels, np.full(len(pixels), depth)))
     moved = pixels + flow[rows, columns] - still
     return np.stack([np.linalg.norm(moved, axis=1), before[rows, columns]], axis=1)

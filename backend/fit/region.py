@@ -36,20 +36,35 @@ class Pictures:
     depths: np.ndarray
     views: tuple[View, ...]
 
+    def of(self, frame: int) -> tuple[np.ndarray, View]:
+        return self.depths[frame], self.views[frame]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
-    """centre [3] m: the middle of the smoke; source [3] m; voxel_size m, of proposals; depths [F, h, w] float32 and views: the
-    pictures that the prior sees; fineness: voxels of what becomes of its proposals, to one of their own; finer: the pictures
-    that this is compared with."""
+    """centre [3] m: the middle of the smoke; source [3] m; voxel_size m, of proposals; pictures: that the prior sees; fineness:
+    voxels of what becomes of its proposals, to one of their own; finer: the pictures that this is compared with."""
 
     centre: np.ndarray
     source: np.ndarray
     voxel_size: float
-    depths: np.ndarray
-    views: tuple[View, ...]
+    pictures: Pictures
     fineness: float
     finer: Pictures
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.pictures.depths)
+
+    @property
+    def finer_size(self) -> float:
+        """m: of a voxel of what becomes of proposals."""
+        return self.voxel_size / self.fineness
+
+    def finely(self, shape: tuple[int, int, int]) -> tuple[int, int, int]:
+        """How many of those there are along a grid of `shape` of the proposals' voxels."""
+        x, y, z = (round(self.fineness * size) for size in shape)
+        return x, y, z
 
 
 def find_region(layers: Series[np.ndarray], scene: Scene, *, fineness: float = FINER) -> Region | None:
@@ -81,8 +96,7 @@ def find_region(layers: Series[np.ndarray], scene: Scene, *, fineness: float = F
         centre=centre,
         source=scene.anchor,
         voxel_size=voxel_size,
-        depths=pictures[shares[0]].depths,
-        views=pictures[shares[0]].views,
+        pictures=pictures[shares[0]],
         fineness=fineness,
         finer=pictures[shares[1]],
     )

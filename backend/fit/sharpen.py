@@ -15,7 +15,7 @@ _UPDATES = 4  # towards the frame's own optical depth
 _FLOOR = 0.01  # optical depth added to both sides of a ratio
 _THIN = 1e-3  # of the largest lasting density, added everywhere
 _MOST_RATIO = 4.0
-_STEP = 0.75  # voxels along a ray; with half of it no volume changes that can be seen
+_STEP = 0.75  # voxels along a ray; with 0.5 no figure changes
 
 
 def sharpened(density: np.ndarray, lasting: np.ndarray) -> np.ndarray:

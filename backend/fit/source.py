@@ -43,7 +43,8 @@ def source_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], *
 
     Of many points before the camera the one is found that stands out most (a difference of Gaussians, Marr and Hildreth 1980,
     in the mean over frames), and others that stand out nearly as much. Against a point counts how far it is from where smoke
-    stands before a camera that does not move, which decides where the camera hardly turns.
+    stands before a camera that does not move, which decides where the camera hardly turns. Where nothing stands out, or what
+    does is far above the foot of all smoke, it is that foot.
     """
     frames = np.unique(np.linspace(0, len(views) - 1, most_frames).astype(int))
     views = [views[frame] for frame in frames]

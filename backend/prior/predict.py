@@ -17,9 +17,7 @@ from backend.geometry.camera import View
 from backend.prior.levels import NAME, LevelNet, level_arrays, read_level_net
 from backend.prior.network import PlumeNet, Sight
 from backend.prior.weights import HINT, WEIGHTS
-from backend.prior.window import Stand, look, stand_before
-
-SHAPE = (24, 24, 40)
+from backend.prior.window import SHAPE, Stand, look, stand_before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from backend.field.lookup import trilinear
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
 
+SHAPE = (24, 24, 40)  # voxels of the grid
 OFFSETS = (-15, -10, -6, -4, -2, -1, 0, 1, 2, 4, 6, 10, 15)  # strides
 NUM_CONDITIONS = 3 * len(OFFSETS)
 
@@ -49,6 +50,11 @@ class Stand:
         """World points [..., 3] m -> [..., 3] voxels from the first one's centre."""
         size = self.lattice.voxel_size
         return points @ (self.from_world[:3, :3].T / size) + (self.from_world[:3, 3] - np.asarray(self.lattice.origin)) / size
+
+    def points(self, voxels: np.ndarray) -> np.ndarray:
+        """[..., 3] voxels from the first one's centre -> world points [..., 3] m."""
+        local = np.asarray(self.lattice.origin) + self.lattice.voxel_size * voxels
+        return (local - self.from_world[:3, 3]) @ self.from_world[:3, :3]
 
     def centres(self) -> np.ndarray:
         """[X, Y, Z, 3] m: the voxels' centres in the world."""

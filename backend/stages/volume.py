@@ -29,8 +29,8 @@ from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.levels import LevelNet
-from backend.prior.predict import SHAPE, Prior, Proposal, one_thread
-from backend.prior.window import Stand, stand_before
+from backend.prior.predict import Prior, Proposal, one_thread
+from backend.prior.window import SHAPE, Stand, stand_before
 from backend.reporting import Report
 
 _MOST_AT_ONCE = 8  # frames; each takes some 70 MB while it is computed
@@ -52,7 +52,7 @@ class Plan:
     @property
     def work(self) -> int:
         """Steps of its progress."""
-        return _LONGER * (self.probes + len(self.asked)) + len(self.region.depths)
+        return _LONGER * (self.probes + len(self.asked)) + self.region.num_frames
 
     @property
     def probes(self) -> int:
@@ -62,33 +62,33 @@ class Plan:
     def proposed(self, prior: Prior, frame: int) -> Proposal:
         """The prior's own word on a frame."""
         region = self.region
-        return self._asked(prior, frame, Pictures(depths=region.depths, views=region.views), region.centre, finer=1.0)
+        return self._said(prior, frame, region.pictures, region.centre, fineness=1.0)
 
     def refined(self, prior: Prior, frame: int) -> Proposal:
         """The same, where wanted on finer voxels with what the prior sees when it looks closer."""
-        proposal, fineness = self.proposed(prior, frame), self.region.fineness
-        if fineness == 1.0:
+        proposal, region = self.proposed(prior, frame), self.region
+        if region.fineness == 1.0:
             return proposal
-        return closer(proposal, self._stand(frame), partial(self._asked, prior, frame, self.region.finer, finer=fineness))
+        return closer(proposal, self._stand(frame), partial(self._said, prior, frame, region.finer, fineness=region.fineness))
 
-    def _asked(self, prior: Prior, frame: int, shown: Pictures, centre: np.ndarray, *, finer: float) -> Proposal:
+    def _said(self, prior: Prior, frame: int, shown: Pictures, centre: np.ndarray, *, fineness: float) -> Proposal:
         return prior.propose(
             lambda number: shown.depths[number],
             lambda number: shown.views[number],
             centre,
             self.region.source,
             frame,
-            voxel_size=self.region.voxel_size / finer,
-            stride=max(1, round(self.stride / finer)),
+            voxel_size=self.region.voxel_size / fineness,
+            stride=max(1, round(self.stride / fineness)),
             num_frames=len(shown.depths),
             seconds_per_frame=self.seconds,
         )
 
     def _stand(self, frame: int) -> Stand:
         """The voxels before the camera of a frame on which its record stands."""
-        region, fineness = self.region, self.region.fineness
-        shape = round(fineness * SHAPE[0]), round(fineness * SHAPE[1]), round(fineness * SHAPE[2])
-        return stand_before(region.views[frame], region.centre, voxel_size=region.voxel_size / fineness, shape=shape)
+        region = self.region
+        view = region.pictures.views[frame]
+        return stand_before(view, region.centre, voxel_size=region.finer_size, shape=region.finely(SHAPE))
 
     def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
         """Of a frame behind that of `index` among those asked and not behind the next."""
@@ -100,9 +100,8 @@ class Plan:
 
     def record(self, proposal: Proposal, lasts: np.ndarray, frame: int) -> VolumeRecord:
         """In the clip's own world, as the frame shows it. lasts [X, Y, Z]: on the proposal's voxels."""
-        region = self.region
         density = sharpened(proposal.density, lasts)
-        density = agreed(density, proposal.stand, region.finer.depths[frame], region.finer.views[frame])
+        density = agreed(density, proposal.stand, *self.region.finer.of(frame))
         return _packed(
             replace(proposal, density=density, velocity=proposal.velocity @ self.straight[:3, :3].astype(np.float32)),
             proposal.stand.from_world @ self.straight,
@@ -137,14 +136,14 @@ def centred(plan: Plan, report: Report, *, prior: Prior, num_done: int = 0, num_
     can miss much of it. What the prior says of a grid that holds part of it points to the rest. num_done: asked frames that were
     answered before; num_workers: as for `propose`.
     """
-    last, count = len(plan.region.depths) - 1, num_probes(len(plan.asked))
+    last, count = plan.region.num_frames - 1, num_probes(len(plan.asked))
     frames = [round(last * (index + 1) / (count + 1)) for index in range(count)]
     for number in range(ROUNDS):
         moment, mass = np.zeros(3), 0.0
         region, done = plan.region, _LONGER * (num_done + count * number)
         ask = partial(plan.proposed, prior)
         for frame, answer in zip(frames, _answers(plan, report, frames, ask, num_workers, done=done), strict=True):
-            density = agreed(answer.density, answer.stand, region.depths[frame], region.views[frame]).astype(np.float64)
+            density = agreed(answer.density, answer.stand, *region.pictures.of(frame)).astype(np.float64)
             moment += density.ravel() @ answer.stand.centres().reshape(-1, 3)
             mass += float(density.sum())
         if not mass > 0.0:
@@ -181,7 +180,7 @@ def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: 
     for index, last in enumerate(plan.asked[1:]):
         before, after = after, words(index + 1)
         for frame in range(plan.asked[index] + 1, last + 1):
-            report.progress(plan.work - len(plan.region.depths) + frame, plan.work)
+            report.progress(plan.work - plan.region.num_frames + frame, plan.work)
             proposal = plan.amid(before, after, index, frame)
             yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
     report.progress(plan.work, plan.work)

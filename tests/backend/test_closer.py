@@ -10,8 +10,8 @@ import pytest
 from backend.fit.closer import TRUST, closer
 from backend.fit.region import FINER
 from backend.geometry.camera import view_at
-from backend.prior.predict import SHAPE, Proposal
-from backend.prior.window import Stand, stand_before
+from backend.prior.predict import Proposal
+from backend.prior.window import SHAPE, Stand, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 
 VIEW = view_at(orbit_cameras(Orbit(), width=72, height=128, fps=15.0, num_frames=135), 30)

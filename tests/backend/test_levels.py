@@ -15,9 +15,9 @@ from backend.fit.region import Pictures, Region
 from backend.geometry.camera import View, view_at
 from backend.prior.levels import NUM_FEATURES, LevelNet, ask, features_of, read_level_net
 from backend.prior.network import PlumeNet
-from backend.prior.predict import SHAPE, Prior, Proposal, read_weights, save_weights
+from backend.prior.predict import Prior, Proposal, read_weights, save_weights
 from backend.prior.sheets import HEIGHT, NUM_LEVELS, NUM_MOMENTS, NUM_PARTS, UNIT, Sheets, look_at_sheets, moments_around
-from backend.prior.window import away_of, stand_before
+from backend.prior.window import SHAPE, away_of, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.level_train import mirrored, reshaped
 
@@ -175,9 +175,7 @@ def region(depth_at: Callable[[int], np.ndarray]) -> Region:
     views = tuple(view(frame) for frame in range(NUM_FRAMES))
     centre = np.array([0.0, 0.0, 8.0])
     pictures = Pictures(depths=depths, views=views)  # type: ignore[arg-type]
-    return Region(
-        depths=pictures.depths, views=views, fineness=1.0, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL
-    )
+    return Region(pictures=pictures, fineness=1.0, finer=pictures, centre=centre, source=SOURCE, voxel_size=VOXEL)
 
 
 def upright_column(at: float, *, finer: float = 1.0) -> Proposal:

@@ -31,7 +31,7 @@ def region(speed: float, views: tuple[View, ...] = VIEWS) -> Region:
 
 def shown(depths: np.ndarray, views: tuple[View, ...]) -> Region:
     pictures = Pictures(depths=depths, views=views)
-    return Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, depths=depths, views=views, fineness=1.0, finer=pictures)
+    return Region(centre=SOURCE, source=SOURCE, voxel_size=VOXEL_SIZE, pictures=pictures, fineness=1.0, finer=pictures)
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.12, 0.3])

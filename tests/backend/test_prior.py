@@ -17,8 +17,8 @@ from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View, view_at
 from backend.geometry.lattice import Lattice
 from backend.prior.network import Conv, PlumeNet, Sight, _folded, _unfolded, follow, seen_at
-from backend.prior.predict import SHAPE, Prior, save_weights
-from backend.prior.window import OFFSETS, Window, look, stand_before
+from backend.prior.predict import Prior, save_weights
+from backend.prior.window import OFFSETS, SHAPE, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 
 SMALL = (16, 16, 16)

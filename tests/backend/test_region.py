@@ -36,18 +36,18 @@ def test_the_grid_is_as_high_as_the_smoke_and_stands_in_its_middle() -> None:
     assert abs(region.centre[2] - 8.0) < 0.4
     assert np.abs(region.centre[:2] - (1.5, -1.0)).max() < 0.7  # drawn to the source a little
     assert abs(region.voxel_size - 13.4 / CELLS_HIGH) < 0.04
-    metres_a_pixel = 32.0 / region.views[0].fx
+    metres_a_pixel = 32.0 / region.pictures.views[0].fx
     assert abs(region.voxel_size / metres_a_pixel - PIXELS_A_CELL) < 0.1
-    assert region.depths.shape == (20, region.views[0].height, region.views[0].width)
+    assert region.pictures.depths.shape == (20, region.pictures.views[0].height, region.pictures.views[0].width)
 
 
 def test_what_proposals_are_compared_with_is_finer_where_the_clip_is() -> None:
     region = find_region(layers(2.0, 14.0, (3.0, -2.0)), Scene(views=VIEWS, seconds_per_frame=1 / 15, anchor=SOURCE))
     assert region is not None
     assert region.finer.depths.shape == (20, region.finer.views[0].height, region.finer.views[0].width)
-    finer = min(FINER, VIEWS[0].height / region.views[0].height)
-    assert region.finer.views[0].height == pytest.approx(finer * region.views[0].height, abs=1)
-    assert region.finer.depths.mean() == pytest.approx(region.depths.mean(), rel=0.02)
+    finer = min(FINER, VIEWS[0].height / region.pictures.views[0].height)
+    assert region.finer.views[0].height == pytest.approx(finer * region.pictures.views[0].height, abs=1)
+    assert region.finer.depths.mean() == pytest.approx(region.pictures.depths.mean(), rel=0.02)
 
 
 def test_nothing_is_nowhere() -> None:

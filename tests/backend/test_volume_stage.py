@@ -23,8 +23,8 @@ from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.levels import LevelNet
 from backend.prior.network import PlumeNet
-from backend.prior.predict import SHAPE, Prior, Proposal, save_weights
-from backend.prior.window import Stand, stand_before
+from backend.prior.predict import Prior, Proposal, save_weights
+from backend.prior.window import SHAPE, Stand, stand_before
 from backend.reporting import SilentReport
 from backend.stages import volume
 from benchmarks.tilted_scene import tilted, turn
@@ -114,7 +114,7 @@ def test_records_are_as_fine_as_wanted(prior: Prior, finer: bool, fineness: floa
     for record in [*proposals, *records]:
         assert record.density.shape == tuple(round(fineness * size) for size in SHAPE)
         assert float(record.voxel_size) == pytest.approx(plan.region.voxel_size / fineness)
-    assert finer == (plan.region.finer.depths.shape != plan.region.depths.shape)
+    assert finer == (plan.region.finer.depths.shape != plan.region.pictures.depths.shape)
 
 
 def test_the_first_and_the_last_frame_are_asked_and_never_more_than_two_strides_apart() -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from backend.fit.state import VisualRecord, VolumeRecord
 from backend.geometry.camera import view_at
-from backend.prior.predict import SHAPE
-from backend.prior.window import stand_before
+from backend.prior.window import SHAPE, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.judge import film, judge, judge_particles, levels_off
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume

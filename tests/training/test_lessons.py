@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from backend.prior.network import PlumeNet, Sight, seen_at
-from backend.prior.predict import SHAPE
-from backend.prior.window import OFFSETS
+from backend.prior.window import OFFSETS, SHAPE
 from training.lessons import write_lessons
 from training.library import Plume
 from training.plumes import plume
