@@ -3,7 +3,8 @@
     .venv/backend/bin/python -m training.source_error --plumes DIR --json FILE
 
 Each plume is filmed once: from a random side and height, by a camera that goes around it by 0.15 to 0.7 degrees a frame, for 40
-to 120 frames. Errors are level with the ground, from the nearest source that burned meanwhile.
+to 120 frames. The source is looked for in all of it, in its halves, and in its first and last quarter. Errors are level with the
+ground, from the nearest source that burned meanwhile.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from backend.fit.foot import foot_point
 from backend.fit.source import source_point
 from backend.geometry.camera import View, view_at
 from backend.io.atomic import write_text
+from backend.prior.window import away_of
 from synthetic.progress import Progress
 from synthetic.sweep import Orbit, orbit_cameras
 from training.judge import opacity_of
@@ -31,27 +33,48 @@ _LENGTHS = 40, 80, 120  # frames of a clip
 _SHOWN = 40  # frames that are drawn of it
 _NOISE = 0.002
 _SMOKE = 0.1  # optical depth; clips that show less are left out
+_PARTS = {
+    "whole": (0.0, 1.0),
+    "first half": (0.0, 0.5),
+    "second half": (0.5, 1.0),
+    "first quarter": (0.0, 0.25),
+    "last quarter": (0.75, 1.0),
+}
+_LITTLE = 20.0  # degrees that the camera goes around
 _WINDY = 0.8  # m/s, and more
 
 
-def source_error(plume: Plume) -> dict[str, float] | None:
-    """Metres, by either way, and what tells plumes apart; None where nothing burns or shows."""
+def source_errors(plume: Plume) -> dict[str, dict[str, float]]:
+    """Of each part of the clip metres, by either way, and what tells clips apart; parts in which nothing burns or shows are left
+    out."""
     draw = np.random.default_rng(plume.scene.seed)
     count = int(draw.choice(_LENGTHS))
     first = int(draw.integers(0, NUM_FRAMES - count + 1))
     frames = np.unique(np.linspace(first, first + count - 1, _SHOWN).round().astype(int))
     views = _views(draw, frames)
-    seconds = frames[[0, -1]] / FPS
-    sources = [item.position for item in plume.scene.sources if item.start < seconds[1] and item.stop > seconds[0]]
     depths = [
         filmed(-np.log1p(-np.clip(opacity_of(plume, int(frame), view), 0.0, 0.99)), _NOISE, draw)
         for frame, view in zip(frames, views, strict=True)
     ]
+    found = {}
+    for name, (start, stop) in _PARTS.items():
+        part = slice(round(start * len(frames)), round(stop * len(frames)))
+        row = _errors(plume, frames[part], views[part], depths[part])
+        if row is not None:
+            found[name] = row
+    return found
+
+
+def _errors(plume: Plume, frames: np.ndarray, views: list[View], depths: list[np.ndarray]) -> dict[str, float] | None:
+    seconds = frames[[0, -1]] / FPS
+    sources = [item.position for item in plume.scene.sources if item.start < seconds[1] and item.stop > seconds[0]]
     if not sources or max(float(depth.max()) for depth in depths) < _SMOKE:
         return None
+    ways = [away_of(view) for view in (views[0], views[-1])]
+    turned = float(np.degrees(np.arccos(np.clip(ways[0] @ ways[1], -1.0, 1.0))))
     found = {"foot": foot_point(depths.__getitem__, views), "source": source_point(depths.__getitem__, views)}
     off = {name: float(np.linalg.norm((np.array(sources) - point)[:, :2], axis=1).min()) for name, point in found.items()}
-    return {"sources": len(sources), "wind": float(np.hypot(*plume.scene.wind)), **off}
+    return {"sources": len(sources), "wind": float(np.hypot(*plume.scene.wind)), "turned": turned, **off}
 
 
 def _views(draw: np.random.Generator, frames: np.ndarray) -> list[View]:
@@ -63,7 +86,7 @@ def _views(draw: np.random.Generator, frames: np.ndarray) -> list[View]:
 
 
 def summary(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Of kinds of plumes: how many, medians of the errors, and how often they are more than a metre."""
+    """Of kinds of clips: how many, means and medians of the errors, and how often they are more than a metre."""
     kinds = {
         "all": rows,
         "windy": [row for row in rows if row["wind"] >= _WINDY],
@@ -73,10 +96,11 @@ def summary(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     }
     found = {}
     for kind, some in kinds.items():
-        line: dict[str, float] = {"plumes": len(some)}
+        line: dict[str, float] = {"clips": len(some)}
         for name in ("foot", "source") if some else ():
             errors = np.array([row[name] for row in some])
             line |= {
+                f"{name}, mean": round(float(errors.mean()), 3),
                 f"{name}, median": round(float(np.median(errors)), 3),
                 f"{name}, beyond 1 m": round(float((errors > 1).mean()), 3),
             }
@@ -92,11 +116,23 @@ def main(arguments: list[str]) -> int:
     folders = sorted(path.parent for path in given.plumes.glob("*/plume.json"))
     found, progress = {}, Progress(label="find sources", total=len(folders))
     for folder in folders:
-        found[folder.name] = source_error(read_plume(folder))
+        found[folder.name] = source_errors(read_plume(folder))
         progress.step()
-    result = {"summary": summary([row for row in found.values() if row]), "plumes": found}
-    write_text(given.json, json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result["summary"], indent=1))
+    rows = [row for parts in found.values() for row in parts.values()]
+    groups = {
+        "whole clips": [parts["whole"] for parts in found.values() if "whole" in parts],
+        "all parts": rows,
+        "parts, camera goes less than 20 degrees around": [row for row in rows if row["turned"] < _LITTLE],
+        "parts, camera goes further": [row for row in rows if row["turned"] >= _LITTLE],
+    }
+    plumes = {
+        name: {part: {key: round(value, 3) for key, value in row.items()} for part, row in parts.items()}
+        for name, parts in found.items()
+    }
+    told = {name: summary(some) for name, some in groups.items()}
+    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(parts)}" for name, parts in plumes.items())
+    write_text(given.json, f'{{"summary": {json.dumps(told, indent=1)},\n"plumes": {{\n{lines}\n}}}}\n')
+    print(json.dumps(told, indent=1))
     return 0
 
 

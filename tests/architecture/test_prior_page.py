@@ -66,6 +66,16 @@ def test_the_page_shows_how_right_the_volumes_are() -> None:
             assert f"| {way} | {name}, {len(those)} | {cells} |" in page
 
 
+def test_the_page_shows_where_smoke_rises_from() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    results = json.loads((CHECKOUT / "docs" / "results" / "source_errors.json").read_text(encoding="utf-8"))
+    for group, kinds in results["summary"].items():
+        for wind in ("windy", "calm"):
+            found = kinds[wind]
+            cells = " | ".join(f"{found[f'{way}, {what}']:.2f}" for way in ("foot", "source") for what in ("mean", "median"))
+            assert f"| {group} | {wind} | {found['clips']} | {cells} |" in page
+
+
 def test_the_page_shows_what_levels_cost() -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     results = json.loads((CHECKOUT / "docs" / "results" / "depth_levels.json").read_text(encoding="utf-8"))
