@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from backend.fit.foot import foot_point
+from backend.fit.scene import turned_about
 from backend.fit.source import source_point
 from backend.geometry.camera import View, view_at
 from backend.io.atomic import write_text
-from backend.prior.window import away_of
 from synthetic.progress import Progress
 from synthetic.sweep import Orbit, orbit_cameras
 from training.judge import opacity_of
@@ -70,11 +71,15 @@ def _errors(plume: Plume, frames: np.ndarray, views: list[View], depths: list[np
     sources = [item.position for item in plume.scene.sources if item.start < seconds[1] and item.stop > seconds[0]]
     if not sources or max(float(depth.max()) for depth in depths) < _SMOKE:
         return None
-    ways = [away_of(view) for view in (views[0], views[-1])]
-    turned = float(np.degrees(np.arccos(np.clip(ways[0] @ ways[1], -1.0, 1.0))))
     found = {"foot": foot_point(depths.__getitem__, views), "source": source_point(depths.__getitem__, views)}
     off = {name: float(np.linalg.norm((np.array(sources) - point)[:, :2], axis=1).min()) for name, point in found.items()}
-    return {"sources": len(sources), "wind": float(np.hypot(*plume.scene.wind)), "turned": turned, **off}
+    told = {
+        "sources": len(sources),
+        "wind": float(np.hypot(*plume.scene.wind)),
+        "turned": math.degrees(turned_about(views, found["source"])),
+        **off,
+    }
+    return {name: round(value, 3) for name, value in told.items()}
 
 
 def _views(draw: np.random.Generator, frames: np.ndarray) -> list[View]:
@@ -125,12 +130,8 @@ def main(arguments: list[str]) -> int:
         "parts, camera goes less than 20 degrees around": [row for row in rows if row["turned"] < _LITTLE],
         "parts, camera goes further": [row for row in rows if row["turned"] >= _LITTLE],
     }
-    plumes = {
-        name: {part: {key: round(value, 3) for key, value in row.items()} for part, row in parts.items()}
-        for name, parts in found.items()
-    }
     told = {name: summary(some) for name, some in groups.items()}
-    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(parts)}" for name, parts in plumes.items())
+    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(parts)}" for name, parts in found.items())
     write_text(given.json, f'{{"summary": {json.dumps(told, indent=1)},\n"plumes": {{\n{lines}\n}}}}\n')
     print(json.dumps(told, indent=1))
     return 0

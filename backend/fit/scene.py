@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,10 +51,10 @@ def is_origin_seen(view: View) -> bool:
     return bool(depth[0] > 0.0 and share.max() <= 1.0)
 
 
-def turned_about(scene: Scene) -> float:
-    """Radians: how far the camera goes around the smoke's anchor. Exact where it goes along an arc: from the place that is
+def turned_about(views: Sequence[View], anchor: np.ndarray) -> float:
+    """Radians: how far the camera goes around the smoke's anchor [3] m. Exact where it goes along an arc: from the place that is
     furthest from the first one to the place that is furthest from that."""
-    ways = np.array([view.position for view in scene.views]) - scene.anchor
+    ways = np.array([view.position for view in views]) - anchor
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
     end = ways[np.argmin(ways @ ways[0])]
     return float(np.arccos(np.clip((ways @ end).min(), -1.0, 1.0)))

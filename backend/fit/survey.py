@@ -94,6 +94,7 @@ def survey(
     some = layers[:: max(1, len(layers) // _DETAIL_FRAMES)]
     is_given = given is not None and config.cameras.mode != "still"
     cameras = _sampled_cameras(given, numbers, start, stop - start, size, clip.fps) if given is not None and is_given else None
+    scene = None if cameras is None or cameras.is_still else make_scene(layers, cameras)
     motion = _motion(frames, layers) if layer.mode == "matte" and not is_given else None
     return Survey(
         size=size,
@@ -107,7 +108,7 @@ def survey(
         opaque_share=float(np.mean(smoke > 0.8)) if smoke.size else 0.0,
         one_hue_error=error_of_one_hue(some, hue_of(layers)),
         detail_errors={share: _detail_error(some, share) for share in DETAIL_SHARES},
-        turn=0.0 if cameras is None or cameras.is_still else turned_about(make_scene(layers, cameras)),
+        turn=0.0 if scene is None else turned_about(scene.views, scene.anchor),
         has_cameras=is_given,
         motion=motion,
         pace=Pace(decode=decode, reduce=reduce, prepare=preparing, extract=extracting, whole=whole.seconds()),
