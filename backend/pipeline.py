@@ -228,7 +228,8 @@ class Pipeline:
                 prior = Prior(self.weights)
                 plan = volume.centred(plan, report, prior=prior, num_done=len(parts))
                 _keep(parts, volume.propose(plan, report, prior=prior, done=parts))
-                write_records(self.folder.volume, mark, volume.run(plan, report, parts, levels=prior.levels))
+                records = volume.run(plan, report, parts, levels=prior.levels, shares=prior.shares)
+                write_records(self.folder.volume, mark, records)
             parts.remove()
 
         self._stage("volume", mark, read_stamp(self.folder.volume), write)

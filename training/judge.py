@@ -167,7 +167,7 @@ def judged(plume: Plume, prior: Prior, *, seed: int) -> dict[str, dict[str, floa
     found, records = {}, []
     for name, way in (("by the pictures", plan), ("by the prior", volume.centred(plan, report, prior=prior))):
         proposals = list(volume.propose(way, report, prior=prior, done=[]))
-        records = list(volume.run(way, report, proposals, levels=prior.levels))
+        records = list(volume.run(way, report, proposals, levels=prior.levels, shares=prior.shares))
         found[name] = judge(plume, records)
     config = preset_config(_PRESET).visual
     particles = list(visual.run(layers, cameras, [], config, report, seed=0, done=[], volumes=records))

@@ -8,7 +8,7 @@ are clips that it loses its way in, by metres and from beginning to end. Those a
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -24,6 +24,17 @@ USUAL = 0.8  # voxels that the two are apart in a clip in which the large one ma
 _POWER = 8  # how soon it is one or the other; both tuned on the same plumes and scenes
 _SMOOTH = 1.5  # voxels of height, standard deviation: neighbouring levels move alike
 _FAINT = 0.01  # of the fullest level: one with less does not move of itself
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """Of the grid of a frame, in voxels of the prior's: where along it the middle of each column's smoke is [X, Z], how wide that
+    smoke is [Z], how unsure the middle is [Z], and whether the level was asked [Z], from 0 to 1."""
+
+    middle: np.ndarray
+    width: np.ndarray
+    unsure: np.ndarray
+    asked: np.ndarray
 
 
 class Levels:
@@ -44,21 +55,22 @@ class Levels:
         apart = (squares / total) ** 0.5 if total else 0.0
         self.share = apart**_POWER / (apart**_POWER + USUAL**_POWER)
 
-    def levelled(self, proposal: Proposal, frame: int) -> Proposal:
-        """Each level moved along the view, with its velocities: the more of the way the surer the small network is."""
+    def levelled(self, proposal: Proposal, frame: int, *, share: float | None = None) -> Proposal:
+        """Each level moved along the view, with its velocities: the more of the way the surer the small network is; share: of all
+        of it, in place of the clip's own."""
         apart, unsure, weight = self._apart(proposal, frame)
         if not weight.any():
             return proposal
-        trust = self.share * OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
-        smooth = _SMOOTH * self._finer(proposal.stand)
+        trust = (self.share if share is None else share) * OWN_ERROR**2 / (OWN_ERROR**2 + unsure**2)
+        smooth = _SMOOTH * self.finer(proposal.stand)
         total = ndimage.gaussian_filter1d(weight, smooth, mode="constant")
         shift = ndimage.gaussian_filter1d(weight * trust * apart, smooth, mode="constant") / (total + 1e-6)
-        shift *= self._finer(proposal.stand)
+        shift *= self.finer(proposal.stand)
         return replace(
             proposal, density=moved(proposal.density, shift), velocity=moved(proposal.velocity, shift, outside="nearest")
         )
 
-    def _finer(self, stand: Stand) -> float:
+    def finer(self, stand: Stand) -> float:
         """Voxels of a stand to one of the prior's, in which all lengths here are."""
         return self.region.voxel_size / stand.lattice.voxel_size
 
@@ -67,29 +79,29 @@ class Levels:
         voxels, and how much it counts, up to 1."""
         columns = proposal.density.sum(axis=1, dtype=np.float64)  # [X, Z]
         mass = columns.sum(axis=0)
-        middle, unsure, asked = self._said(proposal.stand, frame)
-        counted = columns * asked
+        told = self.told(proposal.stand, frame)
+        counted = columns * told.asked
         seen = counted.sum(axis=0)
-        at = np.arange(proposal.density.shape[1]) / self._finer(proposal.stand)
+        at = np.arange(proposal.density.shape[1]) / self.finer(proposal.stand)
         own = np.einsum("xyz,y->z", proposal.density, at) / np.maximum(mass, 1e-12)
-        aim = (counted * middle).sum(axis=0) / np.maximum(seen, 1e-12)
+        aim = (counted * told.middle).sum(axis=0) / np.maximum(seen, 1e-12)
         weight = np.where((seen > 0) & (mass > _FAINT * mass.max(initial=0.0)), mass, 0.0)
-        return aim - own, unsure, weight / max(float(weight.max(initial=0.0)), 1e-12)
+        return aim - own, told.unsure, weight / max(float(weight.max(initial=0.0)), 1e-12)
 
-    def _said(self, stand: Stand, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For the grid of a frame: where the middle of each column's smoke is [X, Z] voxels, of each level how unsure that is [Z]
-        voxels, and whether the level was asked [Z], from 0 to 1."""
+    def told(self, stand: Stand, frame: int) -> Told:
+        """What the small network says of the columns of a frame's grid."""
         frames = moments_around(frame, stride=self.stride, num_frames=self.region.num_frames)
         heights, *said = self._heard(frames)
         later = int(np.clip(np.searchsorted(frames, frame), 1, len(frames) - 1))
         share = np.clip((frame - frames[later - 1]) / max(int(frames[later] - frames[later - 1]), 1), 0.0, 1.0)
-        middle, unsure, asked = ((1.0 - share) * values[later - 1] + share * values[later] for values in said)
-        finer = self._finer(stand)
+        middle, width, unsure, asked = ((1.0 - share) * values[later - 1] + share * values[later] for values in said)
+        finer = self.finer(stand)
         own, source = stand.centres()[0, 0, :, 2], stand.voxels(self.region.source[None])[0] / finer
         at = (np.arange(stand.lattice.shape[0]) / finer - source[0]) / UNIT
         across = [np.interp(at, parts(), row) for row in middle]  # of each level [X]
         deep = np.stack([np.interp(own, heights, column) for column in np.transpose(across)])
-        return source[1] + UNIT * deep, UNIT * np.interp(own, heights, unsure), np.interp(own, heights, asked)
+        width, unsure, asked = (np.interp(own, heights, values) for values in (width, unsure, asked))
+        return Told(middle=source[1] + UNIT * deep, width=UNIT * width, unsure=UNIT * unsure, asked=asked)
 
     def _heard(self, frames: np.ndarray) -> tuple[np.ndarray, ...]:
         """Heights [Z] m, and what the network says of these frames; windows that reach as far are heard once."""

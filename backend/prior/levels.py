@@ -114,12 +114,12 @@ class LevelNet(nn.Module):
 
 
 @torch.no_grad()
-def ask(net: LevelNet, sheets: Sheets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the middles of the parts of each level are behind the source [T, Z, X], how unsure that is [T, Z], both in units, and
-    which levels were asked [T, Z]: others' are any."""
+def ask(net: LevelNet, sheets: Sheets) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where the middles of the parts of each level are behind the source [T, Z, X], how wide a part is in depth [T, Z], how
+    unsure its middle [T, Z], all in units, and which levels were asked [T, Z]: others' are any."""
     features, asked = features_of(*(torch.from_numpy(part)[None] for part in (sheets.profile, sheets.turns, sheets.clues)))
-    middle, _, unsure = net(features, asked)
-    return middle[0].numpy(), unsure[0].exp().numpy(), asked[0].numpy()
+    middle, width, unsure = net(features, asked)
+    return middle[0].numpy(), width[0].clamp(-4.0, 4.0).exp().numpy(), unsure[0].exp().numpy(), asked[0].numpy()
 
 
 def level_arrays(net: LevelNet | None) -> dict[str, np.ndarray]:

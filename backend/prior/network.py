@@ -85,8 +85,8 @@ class UNet(nn.Module):
 
     def forward(self, x: Tensor, conditions: Tensor) -> Tensor:
         gain, shift = self.tune(conditions)[:, :, None, None, None].chunk(2, dim=1)
-        folded = _folded(x).contiguous(memory_format=torch.channels_last_3d)
-        x = functional.silu(self.entry(folded) * (1 + gain) + shift)
+        blocks = folded(x).contiguous(memory_format=torch.channels_last_3d)
+        x = functional.silu(self.entry(blocks) * (1 + gain) + shift)
         passed = []
         for level, block in enumerate(self.down):
             x = block(functional.avg_pool3d(x, 2) if level else x)
@@ -94,7 +94,7 @@ class UNet(nn.Module):
         for level in range(len(self.up) - 1, -1, -1):
             x = functional.interpolate(x, scale_factor=2, mode="nearest")
             x = self.up[level](torch.cat([passed[level], x], dim=1))
-        return _unfolded(self.exit(x)).float()
+        return unfolded(self.exit(x)).float()
 
 
 class PlumeNet(nn.Module):
@@ -171,15 +171,15 @@ def _density_and_velocity(out: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
     return functional.softplus(out[:, 0]) * (_USUAL_SHARE / math.log(2)) * now, out[:, 1:]
 
 
-def _folded(x: Tensor) -> Tensor:
+def folded(x: Tensor) -> Tensor:
     """[B, C, X, Y, Z] -> [B, 8 C, X/2, Y/2, Z/2]: the voxels of a block become channels."""
     b, c, nx, ny, nz = x.shape
     x = x.reshape(b, c, nx // 2, 2, ny // 2, 2, nz // 2, 2)
     return x.permute(0, 1, 3, 5, 7, 2, 4, 6).reshape(b, 8 * c, nx // 2, ny // 2, nz // 2)
 
 
-def _unfolded(x: Tensor) -> Tensor:
-    """The inverse of _folded."""
+def unfolded(x: Tensor) -> Tensor:
+    """The inverse of folded."""
     b, c, nx, ny, nz = x.shape
     x = x.reshape(b, c // 8, 2, 2, 2, nx, ny, nz)
     return x.permute(0, 1, 5, 2, 6, 3, 7, 4).reshape(b, c // 8, 2 * nx, 2 * ny, 2 * nz)

@@ -14,8 +14,11 @@ import torch
 
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
-from backend.prior.levels import NAME, LevelNet, level_arrays, read_level_net
+from backend.prior.levels import NAME as OF_LEVELS
+from backend.prior.levels import LevelNet, level_arrays, read_level_net
 from backend.prior.network import PlumeNet, Sight
+from backend.prior.shares import NAME as OF_SHARES
+from backend.prior.shares import ShareNet, read_share_net, share_arrays
 from backend.prior.weights import HINT, WEIGHTS
 from backend.prior.window import SHAPE, Stand, look, stand_before
 
@@ -30,12 +33,12 @@ class Proposal:
 
 
 class Prior:
-    """The trained networks; several threads may ask them at once. levels: the small one, where the file holds one. Raises
-    BackendError where its weights cannot be read."""
+    """The trained networks; several threads may ask them at once. levels, shares: the small ones, where the file holds them.
+    Raises BackendError where its weights cannot be read."""
 
     def __init__(self, weights: Path = WEIGHTS) -> None:
         try:
-            self.net, self.levels = read_net(weights), read_level_net(weights)
+            self.net, self.levels, self.shares = read_net(weights), read_level_net(weights), read_share_net(weights)
         except (OSError, EOFError, BadZipFile, KeyError, ValueError, TypeError, RuntimeError) as error:
             message = f"{weights} does not hold the weights of this version's prior."
             raise BackendError("prior_unreadable", message, hint=HINT) from error
@@ -77,7 +80,7 @@ def read_weights(weights: Path) -> tuple[tuple[int, ...], dict[str, torch.Tensor
     """The large network's widths, and its parameters by name, float32."""
     with np.load(weights, allow_pickle=False) as arrays:
         widths = tuple(int(width) for width in arrays["widths"])
-        names = [name for name in arrays.files if name != "widths" and not name.startswith(NAME)]
+        names = [name for name in arrays.files if name != "widths" and not name.startswith((OF_LEVELS, OF_SHARES))]
         return widths, {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names}
 
 
@@ -104,15 +107,16 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def save_weights(net: PlumeNet, file: BinaryIO, levels: LevelNet | None = None) -> None:
-    """As float16 of nine bits for ten: less than half the size, and no figure changes."""
-    arrays = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()} | level_arrays(
-        levels
-    )
-    rounded = {name: _rounded(values) for name, values in arrays.items()}
+def save_weights(net: PlumeNet, file: BinaryIO, levels: LevelNet | None = None, shares: ShareNet | None = None) -> None:
+    """As float16, of eight bits for ten in the large network and of nine in the small ones: less than half the size."""
+    large = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()}
+    small = level_arrays(levels) | share_arrays(shares)
+    rounded = {name: _rounded(values, 2) for name, values in large.items()}
+    rounded |= {name: _rounded(values, 1) for name, values in small.items()}
     np.savez_compressed(file, widths=np.array(net.widths), **rounded)  # type: ignore[arg-type]
 
 
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """float16 to the next with an even last bit: what is packed is smaller by one bit of each."""
-    return ((values.view(np.uint16) + np.uint16(1)) & np.uint16(0xFFFE)).view(np.float16)
+def _rounded(values: np.ndarray, bits: int) -> np.ndarray:
+    """float16 to the next whose last `bits` are zero: what is packed is smaller by as many bits of each."""
+    step = 1 << bits
+    return ((values.view(np.uint16) + np.uint16(step // 2)) & np.uint16(0x10000 - step)).view(np.float16)

@@ -7,7 +7,8 @@ what lasts around a frame and with what the frame shows (`run`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,9 +28,11 @@ from backend.fit.scene import make_scene
 from backend.fit.series import Series
 from backend.fit.sharpen import agreed, sharpened
 from backend.fit.state import VolumeRecord
+from backend.fit.weighed import Weighing
 from backend.geometry.upright import turned, up_of, upright
 from backend.prior.levels import LevelNet
 from backend.prior.predict import Prior, Proposal, one_thread
+from backend.prior.shares import ShareNet
 from backend.prior.window import SHAPE, Stand, stand_before
 from backend.reporting import Report
 
@@ -90,22 +93,23 @@ class Plan:
         view = region.pictures.views[frame]
         return stand_before(view, region.centre, voxel_size=region.finer_size, shape=region.finely(SHAPE))
 
-    def amid(self, before: Proposal, after: Proposal, index: int, frame: int) -> Proposal:
-        """Of a frame behind that of `index` among those asked and not behind the next."""
-        first, last = self.asked[index : index + 2]
+    def amid(self, near: Mapping[int, Proposal], later: int, frame: int) -> Proposal:
+        """Of a frame not behind that of `later` among those asked, and behind the one before it. near: proposals of both."""
+        last = self.asked[later]
         if frame == last:
-            return after
+            return near[later]
+        first = self.asked[later - 1]
         share, seconds = (frame - first) / (last - first), (last - first) * self.seconds
-        return between(before, after, self._stand(frame), share=share, seconds=seconds)
+        return between(near[later - 1], near[later], self._stand(frame), share=share, seconds=seconds)
 
-    def record(self, proposal: Proposal, lasts: np.ndarray, frame: int) -> VolumeRecord:
-        """In the clip's own world, as the frame shows it. lasts [X, Y, Z]: on the proposal's voxels."""
-        density = sharpened(proposal.density, lasts)
-        density = agreed(density, proposal.stand, *self.region.finer.of(frame))
-        return _packed(
-            replace(proposal, density=density, velocity=proposal.velocity @ self.straight[:3, :3].astype(np.float32)),
-            proposal.stand.from_world @ self.straight,
-        )
+    def agreed(self, density: np.ndarray, stand: Stand, frame: int) -> np.ndarray:
+        """Density [X, Y, Z] 1/m on the voxels of a stand, as the frame shows it."""
+        return agreed(density, stand, *self.region.finer.of(frame))
+
+    def record(self, proposal: Proposal) -> VolumeRecord:
+        """In the clip's own world."""
+        velocity = proposal.velocity @ self.straight[:3, :3].astype(np.float32)
+        return _packed(replace(proposal, velocity=velocity), proposal.stand.from_world @ self.straight)
 
 
 def make_plan(
@@ -170,29 +174,61 @@ def propose(
         yield _packed(answer, answer.stand.from_world)
 
 
-def run(plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None) -> Iterator[VolumeRecord]:
-    """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels: the prior's network of them;
-    None where it has none."""
-    words = _levelled(plan, proposals, levels)
-    lasts = Lasting(plan.region, words, plan.asked, stride=plan.stride)
-    before = after = words(0)
-    yield plan.record(before, lasts.at(before.stand, 0), 0)
-    for index, last in enumerate(plan.asked[1:]):
-        before, after = after, words(index + 1)
-        for frame in range(plan.asked[index] + 1, last + 1):
-            report.progress(plan.work - plan.region.num_frames + frame, plan.work)
-            proposal = plan.amid(before, after, index, frame)
-            yield plan.record(proposal, lasts.at(proposal.stand, frame), frame)
-    report.progress(plan.work, plan.work)
+def run(
+    plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None, shares: ShareNet | None
+) -> Iterator[VolumeRecord]:
+    """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels, shares: the prior's small
+    networks, None where it has none. That of shares was taught on finer voxels, and needs the other's word."""
+    levelling, weighing = levels_of(plan, proposals, levels), None
+    if levelling is not None and shares is not None and plan.region.fineness > 1.0:
+        weighing = Weighing(region=plan.region, levels=levelling, net=shares)
+    for word in words(plan, proposals, levelling, range(plan.region.num_frames)):
+        density = word.sharp
+        if weighing is not None:
+            density = plan.agreed(weighing.weighed(word.said, word.sharp, word.lasts, word.frame), word.said.stand, word.frame)
+        yield plan.record(replace(word.levelled, density=density))
+        report.progress(plan.work - plan.region.num_frames + word.frame + 1, plan.work)
 
 
-def _levelled(plan: Plan, proposals: Series[VolumeRecord], net: LevelNet | None) -> Callable[[int], Proposal]:
-    """What the prior said of each asked frame, by number, with its levels where the whole clip says that they are."""
+def levels_of(plan: Plan, proposals: Series[VolumeRecord], net: LevelNet | None) -> Levels | None:
+    """None where the prior has no network of them."""
     if net is None:
-        return lambda index: _unpacked(proposals[index])
+        return None
     levels = Levels(plan.region, net, stride=plan.stride)
     levels.weigh((_unpacked(proposals[index]), frame) for index, frame in enumerate(plan.asked))
-    return lambda index: levels.levelled(_unpacked(proposals[index]), plan.asked[index])
+    return levels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Word:
+    """Of a frame, on the voxels of its record: what the prior's large network says of it, the same with its levels where the
+    whole clip has them, what lasts around it, and what fixed powers make of these [X, Y, Z] 1/m."""
+
+    frame: int
+    said: Proposal
+    levelled: Proposal
+    lasts: np.ndarray
+    sharp: np.ndarray
+
+
+def words(plan: Plan, proposals: Series[VolumeRecord], levels: Levels | None, frames: Sequence[int]) -> Iterator[Word]:
+    """Of some frames, in order."""
+
+    def levelled(said: Proposal, frame: int) -> Proposal:
+        return said if levels is None else levels.levelled(said, frame)
+
+    lasting = Lasting(
+        plan.region, lambda index: levelled(_unpacked(proposals[index]), plan.asked[index]), plan.asked, stride=plan.stride
+    )
+    near: dict[int, Proposal] = {}
+    for frame in frames:
+        later = bisect_left(plan.asked, frame)
+        near = {index: near[index] if index in near else _unpacked(proposals[index]) for index in {max(later - 1, 0), later}}
+        said = plan.amid(near, later, frame)
+        own = levelled(said, frame)
+        lasts = lasting.at(own.stand, frame)
+        sharp = plan.agreed(sharpened(own.density, lasts), own.stand, frame)
+        yield Word(frame=frame, said=said, levelled=own, lasts=lasts, sharp=sharp)
 
 
 def _answers(

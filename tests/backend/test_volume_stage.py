@@ -24,6 +24,7 @@ from backend.geometry.camera import view_at
 from backend.prior.levels import LevelNet
 from backend.prior.network import PlumeNet
 from backend.prior.predict import Prior, Proposal, save_weights
+from backend.prior.shares import ShareNet
 from backend.prior.window import SHAPE, Stand, stand_before
 from backend.reporting import SilentReport
 from backend.stages import volume
@@ -43,7 +44,9 @@ def prior(tmp_path_factory: pytest.TempPathFactory) -> Prior:
     for part in (net.first, net.second):
         torch.nn.init.normal_(part.exit.weight, std=0.2)
     file = io.BytesIO()
-    save_weights(net, file, LevelNet(16))
+    shares = ShareNet((8, 8, 8))
+    torch.nn.init.normal_(shares.exit.weight, std=0.5)
+    save_weights(net, file, LevelNet(16), shares)
     path: Path = tmp_path_factory.mktemp("prior") / "weights.npz"
     path.write_bytes(file.getvalue())
     return Prior(path)
@@ -65,7 +68,7 @@ def volumes(
     report, shared = SilentReport(), {"prior": prior, "num_workers": num_workers}
     plan = volume.centred(plan, report, **shared)
     proposals = list(volume.propose(plan, report, done=[], **shared))
-    return list(volume.run(plan, report, proposals, levels=prior.levels))
+    return list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
 
 
 def layers() -> list[np.ndarray]:
@@ -109,12 +112,29 @@ def test_records_are_as_fine_as_wanted(prior: Prior, finer: bool, fineness: floa
     plan = volume.make_plan(layers(), CAMERAS, every=2, stride=16, finer=finer)
     assert plan is not None
     proposals = list(volume.propose(plan, SilentReport(), prior=prior, done=[]))
-    records = list(volume.run(plan, SilentReport(), proposals, levels=prior.levels))
+    records = list(volume.run(plan, SilentReport(), proposals, levels=prior.levels, shares=prior.shares))
     assert len(records) == NUM_FRAMES
     for record in [*proposals, *records]:
         assert record.density.shape == tuple(round(fineness * size) for size in SHAPE)
         assert float(record.voxel_size) == pytest.approx(plan.region.voxel_size / fineness)
     assert finer == (plan.region.finer.depths.shape != plan.region.pictures.depths.shape)
+
+
+@pytest.mark.parametrize(("finer", "is_weighed"), [(False, False), (True, True)])
+def test_shares_are_asked_on_finer_voxels_alone(prior: Prior, finer: bool, is_weighed: bool) -> None:
+    """And of those only the densities differ by them."""
+    plan = volume.make_plan(layers(), CAMERAS, every=2, stride=16, finer=finer)
+    assert plan is not None
+    proposals = list(volume.propose(plan, SilentReport(), prior=prior, done=[]))
+    fixed, learned = (
+        list(volume.run(plan, SilentReport(), proposals, levels=prior.levels, shares=shares)) for shares in (None, prior.shares)
+    )
+    for a, b in zip(fixed, learned, strict=True):
+        assert (a.density.tobytes() != b.density.tobytes()) == is_weighed
+        assert a.velocity.tobytes() == b.velocity.tobytes()
+    without_levels = list(volume.run(plan, SilentReport(), proposals, levels=None, shares=prior.shares))
+    with_nothing = list(volume.run(plan, SilentReport(), proposals, levels=None, shares=None))
+    assert [a.density.tobytes() for a in without_levels] == [b.density.tobytes() for b in with_nothing]
 
 
 def test_the_first_and_the_last_frame_are_asked_and_never_more_than_two_strides_apart() -> None:

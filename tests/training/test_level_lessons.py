@@ -75,7 +75,7 @@ def test_a_training_leaves_both_networks(folder: Path, tmp_path: Path, capsys: p
     assert lines[-1]["taught"][0] < lines[0]["taught"][0]
     assert read_level_net(tmp_path / "both.npz") is not None
     for ours, theirs in zip(read_net(tmp_path / "both.npz").parameters(), large.parameters(), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=2e-3, atol=1e-6)
+        torch.testing.assert_close(ours, theirs, rtol=3e-3, atol=1e-6)
 
 
 def test_weights_that_ship_may_lie_between_those_before_and_those_learned() -> None:
