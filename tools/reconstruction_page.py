@@ -13,6 +13,8 @@ from backend.score.compare import OURS, lead
 Cell = dict[str, Any]
 Cells = Mapping[tuple[str, str], list[Cell]]  # by preset and method
 Figure = Callable[[Cell], float | None]  # None where a cell has none
+FINAL = "final", "default"  # whose figures are to be reached
+PER_FRAME = "per_frame"  # of a cell's scores: what benchmarks.per_frame says of its scene
 
 PICTURES = {
     "reconstruction_middle.jpg": "Truth and reconstruction side by side in every view, in the middle of the clip:",
@@ -70,7 +72,7 @@ VIEW_COLUMNS: dict[str, tuple[Figure, str]] = {
 }
 VOLUME_COLUMNS: dict[str, tuple[Figure, str]] = {
     "density": (of_volume("correlation"), ".3f"),
-    "of the prior": (of_volume("correlation", volume="prior_volume"), ".3f"),
+    "of the volumes followed": (of_volume("correlation", volume="prior_volume"), ".3f"),
     "relative L2": (of_volume("relative_l2"), ".3f"),
     "mass": (of_volume("mass_ratio"), ".3f"),
     "opacity, dB": (of_volume("particles_opacity_db", volume="exported"), ".2f"),
@@ -120,7 +122,7 @@ class Target(NamedTuple):
 
 def targets(every: Cells) -> Iterator[Target]:
     """Means over the scenes of the default method at `final`, but where a title says otherwise."""
-    cells = every["final", "default"]
+    cells = every[FINAL]
 
     def least(title: str, figure: Figure, limit: float, form: str = ".2f") -> Target:
         return Target(title, mean(cells, figure), form, limit)
@@ -131,7 +133,7 @@ def targets(every: Cells) -> Iterator[Target]:
     yield least("NVS, all of it, dB", of_view("nvs", "full_db"), 29.78)
     yield least("side, dB over the best trivial answer", lead_of("side"), 2.5, "+.2f")
     yield least("density correlation", of_volume("correlation"), 0.78, ".3f")
-    gains = [gain for cell in cells if (gain := over_prior(cell)) is not None]
+    gains = [gain for cell in cells if (gain := over_cross_section(cell)) is not None]
     yield Target("density correlation over that of the per-frame prior, worst scene", min(gains, default=None), "+.3f", 0.0)
     yield Target("error of the total mass", mean(cells, mass_error), ".3f", 0.1, is_least=False)
     for name, limit in (("sideways", 0.55), ("up", 0.65), ("depth", 0.3)):
@@ -155,7 +157,7 @@ def targets(every: Cells) -> Iterator[Target]:
 def reached(every: Cells) -> str:
     """The targets, with what the scenes that nothing was tuned on say alone."""
     untouched = {key: found for key, cells in every.items() if (found := [cell for cell in cells if cell["untouched"]])}
-    alone = {target.title: target for target in targets(untouched)} if ("final", "default") in untouched else {}
+    alone = {target.title: target for target in targets(untouched)} if FINAL in untouched else {}
     rows = [
         [
             target.title,
@@ -169,21 +171,50 @@ def reached(every: Cells) -> str:
     return table(["figure", "target", "all", "untouched", "reached"], rows)
 
 
-def over_prior(cell: Cell) -> float | None:
-    ours, prior = (of_volume("correlation", volume=volume)(cell) for volume in ("volume", "prior_volume"))
+def over_cross_section(cell: Cell) -> float | None:
+    ours, prior = of_volume("correlation")(cell), of_volume("cross-section", volume=PER_FRAME)(cell)
     return None if ours is None or prior is None else ours - prior
 
 
-def reconstruction(figures: dict[str, Any], images: Path) -> list[str]:
-    """The section's parts. images: the folder of the pictures, of which those that are there are shown."""
+def with_per_frame(cell: Cell, per_frame: dict[str, Any]) -> Cell:
+    """A cell with what benchmarks.per_frame says of its scene, where that was measured with the same weights."""
+    is_same = cell["weights"] is not None and cell["weights"].startswith(per_frame["weights"])
+    own = per_frame["scenes"].get(cell["scene"], {}) if is_same else {}
+    return {**cell, "scores": {**cell["scores"], PER_FRAME: own}}
+
+
+def by_frame(cells: list[Cell]) -> list[str]:
+    """What knows single frames, beside what knows the clip."""
+    columns = {
+        "cross-section": of_volume("cross-section", volume=PER_FRAME),
+        "the network's own word": of_volume("network", volume=PER_FRAME),
+        "volumes followed": of_volume("correlation", volume="prior_volume"),
+        "particles": of_volume("correlation"),
+    }
+    rows = [[marked(cell), *(shown(figure(cell), ".3f") for figure in columns.values())] for cell in cells]
+    return [
+        "### Beside densities of single frames\n",
+        "Density correlation. `python -m benchmarks.per_frame --jobs DIR/final/default --json docs/results/per_frame.json`: the "
+        "cross-section is the per-frame prior that is to be bettered, row A of the prototype that this project started from; the "
+        "large network sees the frames around one, too, and is asked anew about each. The volumes that the particles follow "
+        "hold what the whole clip says.\n",
+        table(["scene", *columns], rows),
+    ]
+
+
+def reconstruction(figures: dict[str, Any], images: Path, per_frame: dict[str, Any] | None = None) -> list[str]:
+    """The section's parts. images: the folder of the pictures, of which those that are there are shown; per_frame: what
+    benchmarks.per_frame wrote."""
     every: dict[tuple[str, str], list[Cell]] = {}
     for cell in sorted(figures["cells"], key=lambda cell: cell["scene"]):
         every.setdefault((cell["preset"], cell["method"]), []).append(cell)
     every = {key: every[key] for key in ((p, m) for p in PRESETS for m in METHODS) if key in every}
+    if per_frame is not None and FINAL in every:
+        every[FINAL] = [with_per_frame(cell, per_frame) for cell in every[FINAL]]
     parts = ["## Reconstruction\n", how(figures)]
-    if ("final", "default") in every:
+    if FINAL in every:
         parts += [
-            f"What is to be reached and what is, by the default method at `final`: {over_scenes(every['final', 'default'])}.\n",
+            f"What is to be reached and what is, by the default method at `final`: {over_scenes(every[FINAL])}.\n",
             reached(every),
         ]
     for name, text in PICTURES.items():
@@ -192,6 +223,8 @@ def reconstruction(figures: dict[str, Any], images: Path) -> list[str]:
     best = max((key for key in every if key[1] == METHODS[0]), key=lambda key: PRESETS.index(key[0]), default=None)
     if best is not None:
         parts += ["### Beside trivial answers\n", *trivial(best, every[best])]
+    if per_frame is not None and FINAL in every:
+        parts += by_frame(every[FINAL])
     parts += ["### Presets and methods\n", "Means over the scenes; what more seconds buy.\n"]
     parts += [means(every, columns) for columns in (VIEW_COLUMNS, VOLUME_COLUMNS)]
     parts += ["Seconds by stage:\n", stages(every)]

@@ -35,11 +35,12 @@ def main() -> int:
 
 def page() -> str:
     """The text of docs/results.md."""
+    per_frame = load("per_frame") if has("per_frame") else None
     parts = [
         "# What was measured\n",
         "Made by `python -m tools.results` from `docs/results/*.json`, which the named commands wrote. Times are of one "
         "shared machine with two cores that was not always quiet; ratios and memory depend on that less.\n",
-        *(reconstruction(load("reconstruction"), IMAGES) if has("reconstruction") else []),
+        *(reconstruction(load("reconstruction"), IMAGES, per_frame) if has("reconstruction") else []),
         *(tilted_scene(load("tilted_scene")) if has("tilted_scene") else []),
         *whole_path(load("whole_path")),
         *(clip_length(load("clip_length")) if has("clip_length") else []),

@@ -88,10 +88,23 @@ def test_means_and_verdicts_by_hand() -> None:
 
 
 def test_the_worst_scene_decides_against_the_prior() -> None:
-    better, worse = cell("a"), cell("b")
-    better["scores"]["prior_volume"], worse["scores"]["prior_volume"] = {"correlation": 0.7}, {"correlation": 0.81}
-    target = verdicts(better, worse)["density correlation over that of the per-frame prior, worst scene"]
+    """Of weights that are the cell's own."""
+    per_frame = {"weights": "abc", "scenes": {"a": {"cross-section": 0.7}, "b": {"cross-section": 0.81, "network": 0.79}}}
+    found = [page.with_per_frame(cell(scene, weights="abcdef"), per_frame) for scene in ("a", "b", "c")]
+    target = verdicts(*found)["density correlation over that of the per-frame prior, worst scene"]
     assert target.value == pytest.approx(-0.01) and target.verdict == "no"
+    others = [page.with_per_frame(cell("b", weights=weights), per_frame) for weights in (None, "def")]
+    assert verdicts(*others)["density correlation over that of the per-frame prior, worst scene"].value is None
+
+
+def test_densities_of_single_frames_stand_beside_ours(tmp_path: Path) -> None:
+    per_frame = {"weights": "abc", "scenes": {"a": {"cross-section": 0.5, "network": 0.75}}}
+    own = cell("a", weights="abcdef")
+    own["scores"]["prior_volume"] = {"correlation": 0.79}
+    text = "\n".join(page.reconstruction(figures(own, cell("b", untouched=True)), tmp_path, per_frame))
+    assert "| a | 0.500 | 0.750 | 0.790 | 0.800 |" in text
+    assert "| b* | - | - | - | 0.800 |" in text
+    assert "Beside densities" not in "\n".join(page.reconstruction(figures(own), tmp_path))
 
 
 def test_divergence_stands_against_the_published_method() -> None:
