@@ -1,6 +1,6 @@
 """Train the network of shares on its lessons; every tenth plume is held back and scored.
 
-  python -m training.share_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 2000] [--of-views 0.5]
+  python -m training.share_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 450] [--of-views 0.8]
 
 OUT.npz: the weights as they ship, the other networks' of OTHER.npz and with them the running mean of this one's. The log, a line
 of JSON at each tenth part, goes to standard output.
@@ -38,11 +38,13 @@ from backend.prior.window import Stand
 from training.train import bounded, held_back
 
 _BATCH = 4
-_OF_VIEWS = 0.5  # how much the logarithm of a picture's squared error counts, beside the squared error in space
+_OF_VIEWS = 0.8  # how much the logarithm of a picture's squared error counts, beside the squared error in space
 _LIGHT = 0.4  # of opaque smoke in those pictures, linear
 _ASIDE = 90.0  # degrees, of one picture; the other from anywhere between
 _BETWEEN = 25.0, 75.0
-_FORGOTTEN = 2e-3  # of the running mean of the weights, at each step
+_SLOWER = 0.02  # times the rate: what sees around voxels, which else soon knows its lessons by heart
+_WARM = 30  # steps until the rate is reached
+_FORGOTTEN = 2e-2  # of the running mean of the weights, at each step
 _WORST = 1.5  # that one moment's error in space can count
 _SCORED = 3  # every such moment of those held back
 
@@ -176,8 +178,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--lessons", type=Path, required=True)
     parser.add_argument("--beside", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--rate", type=float, default=3e-3)
+    parser.add_argument("--steps", type=int, default=450)
+    parser.add_argument("--rate", type=float, default=1e-2)
     parser.add_argument("--of-views", type=float, default=_OF_VIEWS)
     given = parser.parse_args(arguments)
     paths = sorted(given.lessons.glob("*.npz"))
@@ -190,12 +192,15 @@ def main(arguments: list[str]) -> int:
     beside, levels = read_net(given.beside), read_level_net(given.beside)
     net = ShareNet()
     mean = copy.deepcopy(net)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-3)
+    of_voxels = [*net.each.parameters(), *net.exit.parameters()]
+    of_blocks = [weight for weight in net.parameters() if all(weight is not other for other in of_voxels)]
+    rates = (given.rate, _SLOWER * given.rate)
+    optimiser = torch.optim.AdamW([{"params": of_voxels}, {"params": of_blocks}], lr=given.rate, weight_decay=1e-3)
     begin, sums = time.monotonic(), []
     print(json.dumps({"steps": 0, "moments": len(moments), "plumes": len(plumes) - len(held), **score(net, others)}), flush=True)
     for step in range(given.steps):
-        for group in optimiser.param_groups:
-            group["lr"] = given.rate * min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / given.steps))
+        for group, rate in zip(optimiser.param_groups, rates, strict=True):
+            group["lr"] = rate * min(1.0, (step + 1) / _WARM) * 0.5 * (1 + math.cos(math.pi * step / given.steps))
         part = moments.batch(draw.choice(len(moments), _BATCH, replace=False).tolist())
         if draw.random() < 0.5:
             part = mirrored(part)

@@ -38,11 +38,12 @@ class Told:
 
 
 class Levels:
-    """Of a clip, in its upright world. stride: frames; share: of the way that levels go, all of it until `weigh` is told more."""
+    """Of a clip, in its upright world. stride: frames; share: of the way that levels go, all of it until `weigh` is told more;
+    apart: voxels between the two networks, root of the mean square over the clip's smoke."""
 
     def __init__(self, region: Region, net: LevelNet, *, stride: int) -> None:
         self.region, self.net, self.stride = region, net, stride
-        self.share = 1.0
+        self.share, self.apart = 1.0, USUAL
         self.known: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
 
     def weigh(self, proposals: Iterable[tuple[Proposal, int]]) -> None:
@@ -52,8 +53,8 @@ class Levels:
             apart, _, weight = self._apart(proposal, frame)
             squares += float(weight @ np.square(apart))
             total += float(weight.sum())
-        apart = (squares / total) ** 0.5 if total else 0.0
-        self.share = apart**_POWER / (apart**_POWER + USUAL**_POWER)
+        self.apart = (squares / total) ** 0.5 if total else 0.0
+        self.share = self.apart**_POWER / (self.apart**_POWER + USUAL**_POWER)
 
     def levelled(self, proposal: Proposal, frame: int, *, share: float | None = None) -> Proposal:
         """Each level moved along the view, with its velocities: the more of the way the surer the small network is; share: of all

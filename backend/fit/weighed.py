@@ -41,4 +41,6 @@ class Weighing:
             width=(finer * told.width).astype(np.float32),
             unsure=(finer * told.unsure).astype(np.float32),
             asked=told.asked.astype(np.float32),
+            astray=np.asarray(finer * self.levels.apart, np.float32),
+            lost=np.asarray(self.levels.share, np.float32),
         )

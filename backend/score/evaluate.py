@@ -1,5 +1,5 @@
 """A reconstruction against the truth: views it never saw, frames it never saw, the volume, the velocity; beside it what
-trivial answers get on the same pictures, and the volumes of a prior that treats every frame by itself.
+trivial answers get on the same pictures, and the volumes that the particles followed.
 """
 
 from __future__ import annotations

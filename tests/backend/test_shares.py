@@ -28,6 +28,8 @@ def known(seed: int = 0) -> Known:
         width=draw.uniform(1, 4, SHAPE[2]).astype(np.float32),
         unsure=draw.uniform(0.5, 2, SHAPE[2]).astype(np.float32),
         asked=np.linspace(0, 1, SHAPE[2]).astype(np.float32),
+        astray=np.asarray(1.5 + seed, np.float32),
+        lost=np.asarray(1.0 / (1 + seed), np.float32),
     )
 
 
@@ -62,7 +64,8 @@ def test_every_clue_counts(net: ShareNet) -> None:
     assert seen.shape == (1, NUM_FEATURES, *SHAPE)
     assert np.abs(seen.numpy()).max() < 4.0
     for field in fields(Known):
-        other = replace(one, **{field.name: getattr(known(1), field.name)[..., ::-1].copy()})
+        value = getattr(known(1), field.name)
+        other = replace(one, **{field.name: value[..., ::-1].copy() if value.ndim else value})
         assert not np.allclose(ask(net, other) / other.sharp, ask(net, one) / one.sharp, rtol=1e-3), field.name
 
 
@@ -70,6 +73,12 @@ def test_levels_that_were_not_asked_have_no_say(net: ShareNet) -> None:
     one = replace(known(), asked=np.zeros(SHAPE[2], np.float32))
     other = replace(one, middle=one.middle + 2, width=2 * one.width, unsure=3 * one.unsure)
     np.testing.assert_array_equal(ask(net, one), ask(net, other))
+
+
+def test_where_the_large_network_has_not_lost_its_way_nothing_is_weighed(net: ShareNet) -> None:
+    one, half = (replace(known(), lost=np.asarray(lost, np.float32)) for lost in (0.0, 0.5))
+    np.testing.assert_array_equal(ask(net, one), one.sharp)
+    np.testing.assert_allclose(ask(net, half), np.sqrt(half.sharp * ask(net, known())), rtol=1e-4)
 
 
 def test_weights_are_bounded(net: ShareNet) -> None:

@@ -19,6 +19,17 @@ def weighing(unsure: float = -6.0) -> Weighing:
     return Weighing(region=own, levels=Levels(own, Sure(unsure), stride=2), net=ShareNet())
 
 
+def test_it_is_known_how_far_the_two_networks_are_apart() -> None:
+    said = upright_column(9.0, finer=1.5)
+    own = weighing()
+    own.levels.weigh([(said, FRAME)])
+    found = own.known(said, said.density, said.density, FRAME)
+    aim = said.stand.voxels(SOURCE[None])[0, 1] + 1.5 * UNIT
+    assert float(found.astray) == pytest.approx(abs(aim - middles(said.density)[30]), rel=0.02)
+    assert float(found.lost) == pytest.approx(own.levels.share, abs=1e-6)
+    assert 0.0 < own.levels.share <= 1.0
+
+
 @pytest.mark.parametrize("finer", [1.0, 1.5])
 def test_lengths_are_in_the_records_own_voxels(finer: float) -> None:
     said = upright_column(9.0, finer=finer)

@@ -37,7 +37,7 @@ class _Moment:
 
 def figures(scores: Mapping[str, Any]) -> str:
     """A table; empty without true volumes."""
-    columns = {"ours": scores["volume"], "prior, frame by frame": scores.get("prior_volume", {})}
+    columns = {"ours": scores["volume"], "volumes followed": scores.get("prior_volume", {})}
     columns = {name: found | found.get("velocity", {}) for name, found in columns.items() if found}
     if not columns:
         return ""
