@@ -9,7 +9,7 @@ import numpy as np
 from backend.field.rays import at_voxels
 from backend.fit.levelled import Levels
 from backend.fit.region import Region
-from backend.prior.predict import Proposal
+from backend.prior.predict import Proposal, one_thread
 from backend.prior.shares import Known, ShareNet, ask
 
 
@@ -23,7 +23,9 @@ class Weighing:
 
     def weighed(self, said: Proposal, sharp: np.ndarray, lasts: np.ndarray, frame: int) -> np.ndarray:
         """Density [X, Y, Z] 1/m on the proposal's voxels; along rays it has not the frame's sums yet. The rest: see `known`."""
-        return ask(self.net, self.known(said, sharp, lasts, frame))
+        known = self.known(said, sharp, lasts, frame)
+        with one_thread():
+            return ask(self.net, known)
 
     def known(self, said: Proposal, sharp: np.ndarray, lasts: np.ndarray, frame: int) -> Known:
         """said: by the large network, for that frame. On its voxels [X, Y, Z] 1/m: sharp, what fixed powers make of it, and

@@ -49,6 +49,16 @@ def test_the_page_shows_the_log_of_the_network_of_levels() -> None:
             assert f"| {name} | {entry['steps']} | {cells} |" in page
 
 
+def test_the_page_shows_the_log_of_the_network_of_shares() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    log = (CHECKOUT / "docs" / "results" / "prior_shares.jsonl").read_text(encoding="utf-8").splitlines()
+    entries = [json.loads(line) for line in log]
+    assert len(entries) == 11  # what was started from, and ten
+    for entry in entries[::2]:
+        views = " | ".join(f"{entry[name]:.2f}" for name in ("side_db", "between_db"))
+        assert f"| {entry['steps']} | {entry['density']:.3f} | {entry['space']:.3f} | {views} |" in page
+
+
 def test_the_page_shows_how_right_the_volumes_are() -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     results = json.loads((CHECKOUT / "docs" / "results" / "prior_volumes.json").read_text(encoding="utf-8"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from backend.fit.levelled import Levels
 from backend.fit.weighed import Weighing
@@ -65,3 +66,21 @@ def test_the_frame_is_looked_up_where_each_voxel_is_seen() -> None:
 def test_untaught_it_changes_nothing() -> None:
     said = upright_column(9.0)
     np.testing.assert_array_equal(weighing().weighed(said, 3 * said.density, said.density, FRAME), 3 * said.density)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_any_number_of_threads_says_the_same(threads: int) -> None:
+    said, own = upright_column(9.0), weighing()
+    torch.manual_seed(4)
+    for conv in (own.net.exit, own.net.around):
+        torch.nn.init.normal_(conv.weight, std=0.5)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        found = own.weighed(said, said.density, said.density, FRAME)
+        assert torch.get_num_threads() == threads
+        torch.set_num_threads(1)
+        assert found.tobytes() == own.weighed(said, said.density, said.density, FRAME).tobytes()
+    finally:
+        torch.set_num_threads(before)
+    assert found.tobytes() != said.density.tobytes()
