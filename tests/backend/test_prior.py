@@ -16,7 +16,7 @@ from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import View, view_at
 from backend.geometry.lattice import Lattice
-from backend.prior.network import Conv, PlumeNet, Sight, _folded, _unfolded, follow, seen_at
+from backend.prior.network import Conv, PlumeNet, Sight, folded, follow, seen_at, unfolded
 from backend.prior.predict import Prior, save_weights
 from backend.prior.window import OFFSETS, SHAPE, Window, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
@@ -131,8 +131,8 @@ def test_smoke_is_followed_along_a_uniform_velocity() -> None:
 
 def test_folding_is_undone_by_unfolding() -> None:
     x = torch.arange(2 * 3 * 4 * 6 * 8, dtype=torch.float32).reshape(2, 3, 4, 6, 8)
-    assert _folded(x).shape == (2, 24, 2, 3, 4)
-    torch.testing.assert_close(_unfolded(_folded(x)), x)
+    assert folded(x).shape == (2, 24, 2, 3, 4)
+    torch.testing.assert_close(unfolded(folded(x)), x)
 
 
 def test_density_is_never_negative_and_none_where_the_frame_shows_none() -> None:
