@@ -130,7 +130,7 @@ def mirrored(part: dict[str, Any]) -> dict[str, Any]:
 
 
 def picture_errors(density: Tensor, truth: Tensor, sizes: Tensor, degrees: float) -> Tensor:
-    """[B]: mean squared errors, where either shows smoke, of pictures from far away, so many degrees to the side; sizes [B] m."""
+    """[B]: mean squared errors of pictures from far away, so many degrees to the side; sizes [B] m, of voxels."""
     shown = [_shown(values, sizes, degrees) for values in (density, truth)]
     return (shown[0] - shown[1]).square().mean((1, 2)) + 1e-6
 
