@@ -115,7 +115,7 @@ def fit(
         if plan is not None:
             plan = volume.centred(plan, report, prior=prior, num_workers=1)
             proposals = list(volume.propose(plan, report, prior=prior, done=[], num_workers=1))
-            volumes = list(volume.run(plan, report, proposals, levels=prior.levels))
+            volumes = list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
     shared = {"method": method, "published": PUBLISHED, "volumes": volumes}
     fluid = list(physical.run(layers, cameras, PHYSICAL, report, seed=0, done=[], **shared))
     seen = list(visual.run(layers, cameras, fluid, VISUAL, report, seed=0, done=[], **shared))
