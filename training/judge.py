@@ -46,7 +46,7 @@ from training.samples import lattice_of, truth
 from training.train import held_back
 
 _SIZE = 90, 160  # px
-_LIGHT = 0.4  # of opaque smoke, linear
+LIGHT = 0.4  # of opaque smoke, linear
 _SEEN = 120  # frames of a clip
 _PRESET = "draft"  # of the particles: the volumes that lead them are every preset's
 _VIEWS = {"nvs_last_db": 0.0, "side_db": 90.0}  # degrees from the first place of the camera
@@ -68,7 +68,7 @@ def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Cam
 
 def layer_of(opacity: np.ndarray) -> np.ndarray:
     """[H, W] -> [H, W, 4] float32 premultiplied linear light: evenly lit smoke."""
-    return np.dstack([_LIGHT * opacity] * 3 + [opacity]).astype(np.float32)
+    return np.dstack([LIGHT * opacity] * 3 + [opacity]).astype(np.float32)
 
 
 def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:

@@ -2,13 +2,12 @@
 
   python -m training.level_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 5000] [--start OTHER.npz [--share 0.5]]
 
-OUT.npz: the weights as they ship, the large network's of OTHER.npz and with them the running mean of this one's. The log, a line
+OUT.npz: the weights as they ship, the other networks' of OTHER.npz and with them the running mean of this one's. The log, a line
 of JSON at each twentieth part, goes to standard output.
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
 import math
@@ -19,12 +18,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor, nn
+from torch import Tensor
 
 from backend.io.atomic import whole_file
 from backend.prior.levels import LevelNet, features_of, read_level_net
 from backend.prior.predict import read_net, save_weights
+from backend.prior.shares import read_share_net
 from backend.prior.sheets import HEIGHT, PART, UNIT
+from training.learning import learn, small_network_parser
 from training.train import Stored, bounded, held_back
 
 _BATCH = 32
@@ -146,12 +147,7 @@ def mixed(start: LevelNet, learned: LevelNet, share: float) -> LevelNet:
 
 
 def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lessons", type=Path, required=True)
-    parser.add_argument("--beside", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument("--rate", type=float, default=2e-3)
+    parser = small_network_parser(__doc__, steps=5000, rate=2e-3)
     parser.add_argument("--channels", type=int, default=64)
     parser.add_argument("--start", type=Path, help="weights that are taught on")
     parser.add_argument(
@@ -165,7 +161,7 @@ def main(arguments: list[str]) -> int:
     held = held_back(paths)
     clips, unseen = Clips([path for path in paths if path not in held]), Clips(held)
     torch.manual_seed(0)
-    beside = read_net(given.beside)
+    beside, shares = read_net(given.beside), read_share_net(given.beside)
     net = (read_level_net(given.start) if given.start else None) or LevelNet(given.channels)
     net.train()
     start, mean = copy.deepcopy(net), copy.deepcopy(net)
@@ -181,13 +177,7 @@ def main(arguments: list[str]) -> int:
         of_level, of_parts, of_width, unlikely = errors(net, part)
         terms = [bounded(each, worst=_WORST) for each in (of_level, of_parts, of_width)]
         loss = (terms[0] + _OF_PARTS * terms[1] + _OF_WIDTH * terms[2]).mean() + _OF_DOUBT * unlikely.mean()
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        with torch.no_grad():
-            for kept, now in zip(mean.parameters(), net.parameters(), strict=True):
-                kept.lerp_(now, max(_FORGOTTEN, 1 / (step + 1)))
+        learn(net, mean, optimiser, loss, share=max(_FORGOTTEN, 1 / (step + 1)))
         sums, since = sums + torch.stack([of_level, of_parts, of_width, unlikely]).detach().mean(dim=1), since + 1
         if (step + 1) % max(1, given.steps // 20) == 0:
             taught = sums / since
@@ -200,7 +190,7 @@ def main(arguments: list[str]) -> int:
             print(json.dumps(line | {"seconds": round(time.monotonic() - begin, 1)}), flush=True)
             sums, since = torch.zeros(4), 0
             with whole_file(given.out) as target, open(target, "wb") as file:
-                save_weights(beside, file, mixed(start, mean, given.share))
+                save_weights(beside, file, mixed(start, mean, given.share), shares)
     return 0
 
 

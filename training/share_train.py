@@ -11,7 +11,6 @@ from __future__ import annotations
 from backend import kernel_setup  # noqa: F401 before numba loads
 
 # isort: split
-import argparse
 import copy
 import json
 import math
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from backend.field.rays import at_voxels, optical_depth
@@ -35,11 +34,12 @@ from backend.prior.levels import read_level_net
 from backend.prior.predict import read_net, save_weights
 from backend.prior.shares import NAMES, ShareNet, weights_of
 from backend.prior.window import Stand
+from training.judge import LIGHT
+from training.learning import learn, small_network_parser
 from training.train import bounded, held_back
 
 _BATCH = 4
 _OF_VIEWS = 0.8  # how much the logarithm of a picture's squared error counts, beside the squared error in space
-_LIGHT = 0.4  # of opaque smoke in those pictures, linear
 _ASIDE = 90.0  # degrees, of one picture; the other from anywhere between
 _BETWEEN = 25.0, 75.0
 _SLOWER = 0.02  # times the rate: what sees around voxels, which else soon knows its lessons by heart
@@ -143,7 +143,7 @@ def _shown(density: Tensor, sizes: Tensor, degrees: float) -> Tensor:
     way = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0]]).expand(len(density), 2, 3)
     turned = functional.grid_sample(flat, functional.affine_grid(way, list(flat.shape), align_corners=False), align_corners=False)
     opacity = -torch.expm1(-turned.sum(-1) * sizes[:, None, None])
-    light = (_LIGHT * opacity).clamp_min(0.0)
+    light = (LIGHT * opacity).clamp_min(0.0)
     return torch.where(light > 0.0031308, 1.055 * light.clamp_min(0.0031308) ** (1 / 2.4) - 0.055, 12.92 * light)
 
 
@@ -174,12 +174,7 @@ def score(net: ShareNet, moments: Moments) -> dict[str, float]:
 
 
 def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lessons", type=Path, required=True)
-    parser.add_argument("--beside", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=450)
-    parser.add_argument("--rate", type=float, default=1e-2)
+    parser = small_network_parser(__doc__, steps=450, rate=1e-2)
     parser.add_argument("--of-views", type=float, default=_OF_VIEWS)
     given = parser.parse_args(arguments)
     paths = sorted(given.lessons.glob("*.npz"))
@@ -207,13 +202,7 @@ def main(arguments: list[str]) -> int:
         between = float(draw.choice([-1, 1]) * draw.uniform(*_BETWEEN))
         of_space, of_views = errors(net, part, (_ASIDE, between))
         loss = (bounded(of_space, worst=_WORST) + given.of_views * of_views.log().mean(1)).mean()
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        with torch.no_grad():
-            for kept, now in zip(mean.parameters(), net.parameters(), strict=True):
-                kept.lerp_(now, max(_FORGOTTEN, 1 / (step + 1)))
+        learn(net, mean, optimiser, loss, share=max(_FORGOTTEN, 1 / (step + 1)))
         sums.append([of_space.mean().item(), -10 / math.log(10) * of_views.log().mean().item()])
         if (step + 1) % max(1, given.steps // 10) == 0:
             space, db = np.mean(sums, axis=0)

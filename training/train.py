@@ -26,8 +26,10 @@ from backend.io.atomic import whole_file
 from backend.prior.levels import read_level_net
 from backend.prior.network import PlumeNet, Sight
 from backend.prior.predict import read_weights, save_weights
+from backend.prior.shares import read_share_net
 from backend.prior.window import NUM_CONDITIONS, OFFSETS, SHAPE
 from backend.score.measures import correlation
+from training.learning import learn
 
 _HELD_BACK = 10  # every such plume
 _SCORED = 4  # every such lesson of those held back
@@ -172,14 +174,7 @@ def main(arguments: list[str]) -> int:
                 group["lr"] = given.rate * min(1.0, 50 * done + 0.02) * 0.5 * (1 + math.cos(math.pi * done))
             batch = lessons.batch(order[step * _BATCH : (step + 1) * _BATCH], mirrored=bool((step + number) % 2))
             total, parts = losses(net, batch)
-            optimiser.zero_grad(set_to_none=True)
-            total.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-            optimiser.step()
-            share = max(_FORGOTTEN, 1 / (number * num_steps + step + 1))
-            with torch.no_grad():
-                for kept, now in zip(mean.parameters(), net.parameters(), strict=True):
-                    kept.lerp_(now, share)
+            learn(net, mean, optimiser, total, share=max(_FORGOTTEN, 1 / (number * num_steps + step + 1)))
             sums += parts
         line = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
         note(given.out, line | {"seconds": round(time.monotonic() - begin, 1), **score(mean, unseen)})
@@ -187,7 +182,8 @@ def main(arguments: list[str]) -> int:
             kept = {"net": net.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
             torch.save({**kept, "passes": number + 1}, part)
         with whole_file(given.out / "plumes.npz") as part, open(part, "wb") as file:
-            save_weights(mean, file, read_level_net(given.start) if given.start else None)
+            small = (read_level_net(given.start), read_share_net(given.start)) if given.start else ()
+            save_weights(mean, file, *small)
     return 0
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from backend.prior.parameters import read_parameters
 from backend.prior.sheets import NUM_CLUES, NUM_PARTS, Sheets, parts
 
 NUM_FEATURES = 15 + NUM_CLUES + NUM_PARTS
@@ -122,20 +123,9 @@ def ask(net: LevelNet, sheets: Sheets) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return middle[0].numpy(), width[0].clamp(-4.0, 4.0).exp().numpy(), unsure[0].exp().numpy(), asked[0].numpy()
 
 
-def level_arrays(net: LevelNet | None) -> dict[str, np.ndarray]:
-    """Its parameters by name, as float16."""
-    state = {} if net is None else net.state_dict()
-    return {NAME + name: tensor.numpy().astype(np.float16) for name, tensor in state.items()}
-
-
 def read_level_net(weights: Path) -> LevelNet | None:
     """None where the file holds none. Raises what numpy and torch raise where it holds something else."""
-    with np.load(weights, allow_pickle=False) as arrays:
-        state = {
-            name.removeprefix(NAME): torch.from_numpy(arrays[name].astype(np.float32))
-            for name in arrays.files
-            if name.startswith(NAME)
-        }
+    state = read_parameters(weights, NAME)
     if not state:
         return None
     net = LevelNet(len(state["entry.bias"]))

@@ -15,10 +15,11 @@ import torch
 from backend.contract.errors import BackendError
 from backend.geometry.camera import View
 from backend.prior.levels import NAME as OF_LEVELS
-from backend.prior.levels import LevelNet, level_arrays, read_level_net
+from backend.prior.levels import LevelNet, read_level_net
 from backend.prior.network import PlumeNet, Sight
+from backend.prior.parameters import parameters_of
 from backend.prior.shares import NAME as OF_SHARES
-from backend.prior.shares import ShareNet, read_share_net, share_arrays
+from backend.prior.shares import ShareNet, read_share_net
 from backend.prior.weights import HINT, WEIGHTS
 from backend.prior.window import SHAPE, Stand, look, stand_before
 
@@ -109,9 +110,8 @@ def one_thread() -> Iterator[None]:
 
 def save_weights(net: PlumeNet, file: BinaryIO, levels: LevelNet | None = None, shares: ShareNet | None = None) -> None:
     """As float16, of eight bits for ten in the large network and of nine in the small ones: less than half the size."""
-    large = {name: tensor.detach().numpy().astype(np.float16) for name, tensor in net.state_dict().items()}
-    small = level_arrays(levels) | share_arrays(shares)
-    rounded = {name: _rounded(values, 2) for name, values in large.items()}
+    small = parameters_of(levels, OF_LEVELS) | parameters_of(shares, OF_SHARES)
+    rounded = {name: _rounded(values, 2) for name, values in parameters_of(net, "").items()}
     rounded |= {name: _rounded(values, 1) for name, values in small.items()}
     np.savez_compressed(file, widths=np.array(net.widths), **rounded)  # type: ignore[arg-type]
 

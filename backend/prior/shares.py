@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from backend.prior.network import Conv, folded
+from backend.prior.parameters import read_parameters
 
 NAME = "shares."  # before the names of its parameters, beside those of the large network
 CHANNELS = 32, 16, 32  # of a voxel; of blocks, and of larger ones
@@ -65,7 +66,7 @@ def features_of(known: Mapping[str, Tensor]) -> Tensor:
     lengths = [(known[name] / 3).log()[:, None, None, :] for name in ("width", "unsure")]
     column = [off / 2, torch.exp(-0.5 * off.square()), *lengths]
     height = torch.linspace(-1.0, 1.0, shape[3]).expand(shape)
-    apart = [_logarithm_of_voxels(each)[:, None, None, :] for each in (_apart(known), known["astray"][:, None])]
+    apart = [(each / 3 + 0.1).log()[:, None, None, :] for each in (_apart(known), known["astray"][:, None])]
     column += [each.expand(shape) for each in apart]
     rows = [*densities, _logarithm(known["depth"], _THIN), *(asked * value for value in column), asked, height]
     return torch.stack(rows, 1)
@@ -78,10 +79,6 @@ def _apart(known: Mapping[str, Tensor]) -> Tensor:
     along = torch.arange(known["said"].shape[2], dtype=torch.float32)
     own = torch.einsum("bxyz,y->bz", known["said"], along) / mass
     return (own - (columns * known["middle"]).sum(1) / mass).abs()
-
-
-def _logarithm_of_voxels(lengths: Tensor) -> Tensor:
-    return (lengths / 3 + 0.1).log()
 
 
 def _logarithm(values: Tensor, least: float) -> Tensor:
@@ -133,20 +130,9 @@ def ask(net: ShareNet, known: Known) -> np.ndarray:
     return known.sharp * weights_of(net, batch)[0].numpy()
 
 
-def share_arrays(net: ShareNet | None) -> dict[str, np.ndarray]:
-    """Its parameters by name, as float16."""
-    state = {} if net is None else net.state_dict()
-    return {NAME + name: tensor.detach().numpy().astype(np.float16) for name, tensor in state.items()}
-
-
 def read_share_net(weights: Path) -> ShareNet | None:
     """None where the file holds none. Raises what numpy and torch raise where it holds something else."""
-    with np.load(weights, allow_pickle=False) as arrays:
-        state = {
-            name.removeprefix(NAME): torch.from_numpy(arrays[name].astype(np.float32))
-            for name in arrays.files
-            if name.startswith(NAME)
-        }
+    state = read_parameters(weights, NAME)
     if not state:
         return None
     hidden, near, far = (len(state[name]) for name in ("each.bias", "entry.bias", "down.1.bias"))

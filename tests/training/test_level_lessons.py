@@ -13,6 +13,7 @@ import torch
 from backend.prior.levels import LevelNet, read_level_net
 from backend.prior.network import PlumeNet
 from backend.prior.predict import read_net, save_weights
+from backend.prior.shares import ShareNet, read_share_net
 from backend.prior.sheets import HEIGHT, NUM_LEVELS, NUM_MOMENTS, NUM_PARTS, parts
 from training.level_lessons import draw_clip, write_lessons
 from training.level_train import Clips, main, mixed
@@ -57,7 +58,7 @@ def test_the_same_number_draws_the_same_clip(recorded: Plume) -> None:
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
 
 
-def test_a_training_leaves_both_networks(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_leaves_all_networks(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "lessons").mkdir()
     write_lessons(folder, tmp_path / "lessons" / "0000.npz", seed=3, count=4)
     for number in range(1, 7):
@@ -65,7 +66,7 @@ def test_a_training_leaves_both_networks(folder: Path, tmp_path: Path, capsys: p
     assert len(Clips([tmp_path / "lessons" / "0000.npz"])) == 4
     large = PlumeNet((8, 8, 8))
     with open(tmp_path / "large.npz", "wb") as file:
-        save_weights(large, file)
+        save_weights(large, file, shares=ShareNet())
     arguments = ["--lessons", tmp_path / "lessons", "--beside", tmp_path / "large.npz", "--out", tmp_path / "both.npz"]
     threads = torch.get_num_threads()
     assert main([str(argument) for argument in [*arguments, "--steps", 40, "--channels", 16]]) == 0
@@ -74,6 +75,7 @@ def test_a_training_leaves_both_networks(folder: Path, tmp_path: Path, capsys: p
     assert len(lines) == 20
     assert lines[-1]["taught"][0] < lines[0]["taught"][0]
     assert read_level_net(tmp_path / "both.npz") is not None
+    assert read_share_net(tmp_path / "both.npz") is not None
     for ours, theirs in zip(read_net(tmp_path / "both.npz").parameters(), large.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=3e-3, atol=1e-6)
 
