@@ -19,6 +19,7 @@ from backend.contract.result import vdb_path
 from backend.geometry.lattice import Lattice
 from backend.io.particles import ParticleFrame, Particles
 from backend.io.vdb import write_vdb
+from backend.render.motion import unblurred
 from backend.render.voxelize import CUTOFF, splat_extents, voxelize
 from backend.reporting import Report
 
@@ -171,7 +172,7 @@ def _survey(particles: Particles) -> _Survey:
 def _vdb_frame(frame: ParticleFrame, index: int, plan: ExportPlan, report: Report) -> VdbFrame:
     frame = _visible(frame)
     lattice = _lattice(frame, plan)
-    grids = voxelize(frame, lattice, with_color=plan.has_color)
+    grids = voxelize(unblurred(frame), lattice, with_color=plan.has_color)
     if plan.is_trimmed and frame.count:
         total = float(frame.optical_masses.sum(dtype=np.float64))
         kept = float(grids["density"].sum(dtype=np.float64)) * plan.voxel_size**3
