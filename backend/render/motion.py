@@ -37,7 +37,7 @@ def unblurred(frame: ParticleFrame) -> ParticleFrame:
 
 
 def _lattice_of(frame: ParticleFrame) -> Lattice | None:
-    """Voxels as large as half of the Gaussians are narrow, around all of them; None where that is nothing, or would be too many."""
+    """Voxels as large as half of the Gaussians are narrow, around all of them; None where that is none, or too many."""
     if not frame.count:
         return None
     size = float(np.median(np.asarray(frame.scales, np.float64).reshape(frame.count, -1).min(axis=1)))
