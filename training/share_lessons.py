@@ -33,7 +33,7 @@ from backend.reporting import SilentReport
 from backend.stages import volume
 from training.judge import layer_of
 from training.lessons import draw_some, write_all
-from training.library import FPS, NUM_FRAMES, Plume, read_plume
+from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume, read_plume
 from training.samples import LEAST_WHOLE, MOST, camera_way, cell_for, filmed, lattice_of, smoke_of, truth
 
 _SHORTEST = 45  # frames of a clip
@@ -59,6 +59,7 @@ def draw_clip(plume: Plume, draw: np.random.Generator, *, prior: Prior) -> dict[
     weighing = Weighing(region=plan.region, levels=levels, net=ShareNet())
     edges = np.linspace(0, num_frames, _MOMENTS + 1).astype(int)
     moments = [int(draw.integers(low, high)) for low, high in pairwise(edges)]
+    moments = [max(moment - (first + moment) % VELOCITY_EVERY, 0) for moment in moments]  # those whose velocities are known, too
     rows = []
     for word in volume.words(plan, proposals, levels, moments):
         stand = word.said.stand

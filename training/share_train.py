@@ -1,6 +1,6 @@
 """Train the network of shares on its lessons; every tenth plume is held back and scored.
 
-  python -m training.share_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 450] [--of-views 0.8]
+  python -m training.share_train --lessons DIR --beside OTHER.npz --out OUT.npz [--steps 450] [--of-views 0.5]
 
 OUT.npz: the weights as they ship, the other networks' of OTHER.npz and with them the running mean of this one's. The log, a line
 of JSON at each tenth part, goes to standard output.
@@ -34,12 +34,13 @@ from backend.prior.levels import read_level_net
 from backend.prior.predict import read_net, save_weights
 from backend.prior.shares import NAMES, ShareNet, weights_of
 from backend.prior.window import Stand
+from backend.score.measures import correlation
 from training.judge import LIGHT
 from training.learning import learn, small_network_parser
 from training.train import bounded, held_back
 
 _BATCH = 4
-_OF_VIEWS = 0.8  # how much the logarithm of a picture's squared error counts, beside the squared error in space
+_OF_VIEWS = 0.5  # how much the logarithm of a picture's squared error counts, beside the squared error in space
 _ASIDE = 90.0  # degrees, of one picture; the other from anywhere between
 _BETWEEN = 25.0, 75.0
 _SLOWER = 0.02  # times the rate: what sees around voxels, which else soon knows its lessons by heart
@@ -47,17 +48,19 @@ _WARM = 30  # steps until the rate is reached
 _FORGOTTEN = 2e-2  # of the running mean of the weights, at each step
 _WORST = 1.5  # that one moment's error in space can count
 _SCORED = 3  # every such moment of those held back
+_LEAST_ALIKE = 0.78  # correlation of what fixed powers make with the truth: moments that are worse teach to mistrust all smoke
 
 
 class Moments:
-    """Those of some files, in memory, as they were stored."""
+    """Those of some files, in memory, as they were stored; without those whose density is less like the truth than `least`."""
 
-    def __init__(self, paths: list[Path]) -> None:
+    def __init__(self, paths: list[Path], *, least: float = -1.0) -> None:
         self.rows: list[dict[str, np.ndarray]] = []
         for path in paths:
             with np.load(path) as arrays:
                 stacks = {name: arrays[name] for name in arrays.files}
-            self.rows += [{name: stack[index] for name, stack in stacks.items()} for index in range(len(stacks["truth"]))]
+            rows = [{name: stack[index] for name, stack in stacks.items()} for index in range(len(stacks["truth"]))]
+            self.rows += [row for row in rows if correlation(row["sharp"], row["truth"]) >= least]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -181,7 +184,9 @@ def main(arguments: list[str]) -> int:
     plumes = sorted({path.name.split("_")[0] for path in paths})
     held = {path.name for path in held_back([Path(name) for name in plumes])}
     taught, unseen = ([path for path in paths if (path.name.split("_")[0] in held) == is_held] for is_held in (False, True))
-    moments, others = Moments(taught), Moments(unseen)
+    moments, others = Moments(taught, least=_LEAST_ALIKE), Moments(unseen)
+    if len(moments) < _BATCH:
+        parser.error(f"{given.lessons} holds {len(moments)} moments to learn from; draw lessons of more plumes.")
     torch.manual_seed(0)
     draw = np.random.default_rng(0)
     beside, levels = read_net(given.beside), read_level_net(given.beside)

@@ -31,10 +31,11 @@ def prior(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def lessons(recorded: Plume, prior: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One clip of one plume, under the names of eleven."""
+    """One clip of one plume, under the names of eleven; what is known is nearly right, as no random network says."""
     folder = tmp_path_factory.mktemp("lessons")
     clip = share_lessons.draw_clip(recorded, np.random.default_rng(0), prior=Prior(prior))
     assert clip is not None
+    clip["sharp"] = clip["truth"] * np.random.default_rng(1).uniform(0.5, 1.5, clip["truth"].shape).astype(np.float16)
     for number in range(11):
         np.savez(folder / f"{number:04d}_0.npz", **clip)  # type: ignore[arg-type]
     return folder
@@ -103,6 +104,18 @@ def test_pictures_from_aside_are_what_they_say() -> None:
     assert aside > 1e-3
     assert picture_errors(thin, deep, size, -90.0).item() == pytest.approx(aside, rel=1e-3)
     assert picture_errors(thin, thin, size, 33.0).item() < 1e-5
+
+
+def test_moments_that_are_nothing_like_the_truth_are_left_out(lessons: Path, tmp_path: Path) -> None:
+    path = lessons / "0000_0.npz"
+    whole = Moments([path])
+    with np.load(path) as arrays:
+        clip = dict(arrays)
+    clip["sharp"] = clip["truth"].copy()
+    clip["sharp"][1] = clip["truth"][1, ::-1, ::-1, ::-1]
+    np.savez(tmp_path / "0000_0.npz", **clip)  # type: ignore[arg-type]
+    assert len(Moments([tmp_path / "0000_0.npz"], least=0.78)) == len(whole) - 1
+    assert len(Moments([tmp_path / "0000_0.npz"])) == len(whole)
 
 
 def test_a_training_leaves_all_networks(lessons: Path, prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
