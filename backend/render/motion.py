@@ -18,7 +18,8 @@ from backend.io.particles import ParticleFrame
 from backend.render.voxelize import CUTOFF, voxelize
 
 _ROUNDS = 2
-_MOST_VOXELS = 4_000_000  # in which means are found: smoke that is spread out wider stays as it is
+_COARSER = 1.5  # than half of the Gaussians are narrow: voxels in which means are found
+_MOST_VOXELS = 4_000_000  # of these: smoke that is spread out wider stays as it is
 _THIN = 1e-3  # of the largest density: with so much, half of a voxel's velocity is its own
 
 
@@ -37,10 +38,10 @@ def unblurred(frame: ParticleFrame) -> ParticleFrame:
 
 
 def _lattice_of(frame: ParticleFrame) -> Lattice | None:
-    """Voxels as large as half of the Gaussians are narrow, around all of them; None where that is none, or too many."""
+    """Voxels a little larger than half of the Gaussians are narrow, around all of them; None where that is none, or too many."""
     if not frame.count:
         return None
-    size = float(np.median(np.asarray(frame.scales, np.float64).reshape(frame.count, -1).min(axis=1)))
+    size = _COARSER * float(np.median(np.asarray(frame.scales, np.float64).reshape(frame.count, -1).min(axis=1)))
     low, high = (np.asarray(bound(frame.positions, axis=0), np.float64) for bound in (np.min, np.max))
     sides = (high - low) / size + 2.0 * CUTOFF if size > 0.0 else np.full(3, np.inf)
     if not sides.prod() <= _MOST_VOXELS:
