@@ -28,6 +28,14 @@ if "wildsmoke" not in sys.modules and (CHECKOUT / "__init__.py").exists():
     spec.loader.exec_module(module)
 
 
+def pytest_configure() -> None:
+    """No test of random examples fails because the machine was busy for a moment."""
+    from hypothesis import settings  # not before: see above
+
+    settings.register_profile("busy", deadline=None)
+    settings.load_profile("busy")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Here, because pytest asks only the topmost conftest for options."""
     group = parser.getgroup("extremes", "tests/extremes")
