@@ -33,9 +33,8 @@ from backend.geometry.camera import View, view_at
 from backend.io.atomic import write_text
 from backend.prior.predict import Prior
 from backend.prior.weights import WEIGHTS, weights_fingerprint
-from backend.render.motion import beyond, unblurred
+from backend.render.motion import smoke_and_motion
 from backend.render.picture import picture
-from backend.render.voxelize import voxelize
 from backend.reporting import SilentReport
 from backend.score.measures import coded, correlation, decibels, velocity_scores
 from backend.score.volumes import camera_axes
@@ -100,10 +99,8 @@ def judge_particles(plume: Plume, cameras: Cameras, records: list[VisualRecord])
     rows = []
     for frame in _moments(plume):
         ours = particle_frame(records[frame])
-        grids = voxelize(unblurred(ours), lattice_of(plume))
-        moves = beyond(grids["density"], grids["velocity"])
         real = plume.density_at(frame), plume.velocity_at(frame)
-        row = _row((grids["density"], moves), real, axes=camera_axes(view_at(cameras, frame)))
+        row = _row(smoke_and_motion(ours, lattice_of(plume)), real, axes=camera_axes(view_at(cameras, frame)))
         for name, view in _views(frame).items():
             row[name] = _likeness(picture(ours, view), plume, frame, view)
         rows.append(row)

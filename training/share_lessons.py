@@ -58,8 +58,8 @@ def draw_clip(plume: Plume, draw: np.random.Generator, *, prior: Prior) -> dict[
         raise ValueError("a prior without a network of levels has nothing to weigh")
     weighing = Weighing(region=plan.region, levels=levels, net=ShareNet())
     edges = np.linspace(0, num_frames, _MOMENTS + 1).astype(int)
-    moments = [int(draw.integers(low, high)) for low, high in pairwise(edges)]
-    moments = [max(moment - (first + moment) % VELOCITY_EVERY, 0) for moment in moments]  # those whose velocities are known, too
+    drawn = [int(draw.integers(low, high)) for low, high in pairwise(edges)]
+    moments = [max(moment - (first + moment) % VELOCITY_EVERY, 0) for moment in drawn]  # whose velocities a library holds, too
     rows = []
     for word in volume.words(plan, proposals, levels, moments):
         stand = word.said.stand

@@ -23,6 +23,12 @@ _MOST_VOXELS = 4_000_000  # of these: smoke that is spread out wider stays as it
 _THIN = 1e-3  # of the largest density: with so much, half of a voxel's velocity is its own
 
 
+def smoke_and_motion(frame: ParticleFrame, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Density [X, Y, Z] 1/m, and velocity [X, Y, Z, 3] m/s at every voxel."""
+    grids = voxelize(unblurred(frame), lattice)
+    return grids["density"], beyond(grids["density"], grids["velocity"])
+
+
 def unblurred(frame: ParticleFrame) -> ParticleFrame:
     """The frame with velocities for `voxelize`; nothing else should read them."""
     lattice = _lattice_of(frame)
@@ -61,9 +67,7 @@ def beyond(density: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 def _filled(weight: np.ndarray, values: np.ndarray, least: float) -> np.ndarray:
     """values [X, Y, Z, C] of weights [X, Y, Z]; those of less than `least` mostly from larger blocks."""
-    if weight.size == 0 or not least > 0.0:
-        return values
-    if max(weight.shape) == 1:
+    if not least > 0.0 or max(weight.shape) == 1:  # no smoke at all; one block of all voxels
         return values
     sums, weights = _in_blocks(weight[..., None] * values), _in_blocks(weight)
     means = sums / np.maximum(weights, np.float32(1e-30))[..., None]

@@ -9,9 +9,8 @@ import numpy as np
 from backend.geometry.camera import View
 from backend.io.particles import ParticleFrame, Particles
 from backend.physics.divergence import both_divergences
-from backend.render.motion import beyond, unblurred
+from backend.render.motion import smoke_and_motion
 from backend.render.picture import picture_of
-from backend.render.voxelize import voxelize
 from backend.reporting import Report, SilentReport
 from backend.score.truth_set import Volume
 
@@ -30,8 +29,7 @@ class ParticlePrediction:
 
     def volume(self, like: Volume, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Density, and velocity wherever it is asked; beyond the smoke that of the smoke next to it."""
-        grids = voxelize(unblurred(self._at(frame)), like.lattice)
-        return grids["density"], beyond(grids["density"], grids["velocity"])
+        return smoke_and_motion(self._at(frame), like.lattice)
 
     def _at(self, frame: int) -> ParticleFrame:
         """The particles of a frame; those that were asked for last are kept, for a frozen one is asked for again and again."""
