@@ -16,7 +16,7 @@ from backend.fit import depth_prior, explain
 from backend.fit.colors import hue_of
 from backend.fit.depths import Depths
 from backend.fit.follow import drawn_level, drawn_near, points_on_rays
-from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
+from backend.fit.population import frame_mass, is_in_image, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
 from backend.fit.scene import Scene, optical_depth
 from backend.fit.series import Series
@@ -31,6 +31,7 @@ RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in 
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
+FADES = 0.013  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
 
 
@@ -78,11 +79,13 @@ class Appearance:
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
         guide = self.depths.guide(frame)
+        is_led = is_in_image(record.positions, view)
         if guide is not None:
-            record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses))
+            record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses, is_led))
         record = self._calmed(record, layer, view)
         if guide is not None:
-            record = replace(record, optical_masses=drawn_level(guide, record.positions, record.optical_masses))
+            masses = np.where(is_led, record.optical_masses, self._faded(record, view))
+            record = replace(record, optical_masses=drawn_level(guide, record.positions, masses, is_led))
         else:
             prior = self.depths.prior(frame)
             record = replace(record, positions=depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH))
@@ -92,6 +95,14 @@ class Appearance:
         if config.iterations == 0:
             return record, 0.0
         return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale, hue=self.hue)
+
+    def _faded(self, record: VisualRecord, view: View) -> np.ndarray:
+        """Masses [N] of particles that go on beside the picture: the further, the less is known of them, and smoke in a wrong
+        place is worse than none."""
+        _, away = view.project(record.positions)
+        step = self.scene.seconds_per_frame * np.linalg.norm(record.velocities, axis=1)
+        sides = step * view.fx / np.maximum(np.abs(away), 1e-12) / max(view.width, view.height)
+        return record.optical_masses * 0.5 ** (sides / FADES).astype(np.float32)
 
     def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View) -> VisualRecord:
         """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows.

@@ -65,17 +65,26 @@ class Balance:
         return np.clip(1.0 + trilinear(more, self.places, outside="grid-constant"), 1.0 / MOST_RATIO, MOST_RATIO)
 
 
-def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:
-    """Positions [N, 3] m of masses [N] m^2, most of the way to the volume's density."""
-    return positions + FOLLOW_PLACES * Balance(guide, positions, masses.astype(np.float64)).displacement()
+def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray, is_led: np.ndarray) -> np.ndarray:
+    """Positions [N, 3] m of masses [N] m^2, most of the way to the volume's density.
+
+    is_led [N] bool: the others stay, and do not count. Beside its frame's picture a volume has next to nothing left, whatever
+    is there; what particles were when the picture showed them tells more.
+    """
+    moved = positions.copy()
+    moved[is_led] += FOLLOW_PLACES * Balance(guide, positions[is_led], masses[is_led].astype(np.float64)).displacement()
+    return moved
 
 
-def drawn_level(guide: Guide, positions: np.ndarray, masses: np.ndarray) -> np.ndarray:
-    """Masses [N] m^2 at positions [N, 3] m brought to the volume's density; of the type that they had."""
-    exact = masses.astype(np.float64)
+def drawn_level(guide: Guide, positions: np.ndarray, masses: np.ndarray, is_led: np.ndarray) -> np.ndarray:
+    """Masses [N] m^2 at positions [N, 3] m brought to the volume's density, those that are led, see above; of the type that
+    they had."""
+    exact = masses[is_led].astype(np.float64)
     for _ in range(_ROUNDS):
-        exact = exact * Balance(guide, positions, exact).ratios()
-    return exact.astype(masses.dtype)
+        exact = exact * Balance(guide, positions[is_led], exact).ratios()
+    levelled = masses.copy()
+    levelled[is_led] = exact
+    return levelled
 
 
 def points_on_rays(guide: Guide, view: View, pixels: np.ndarray, otherwise: np.ndarray, *, seed: int) -> np.ndarray:

@@ -24,6 +24,7 @@ from backend.fit.follow import drawn_near
 from backend.fit.guide import Guide
 from backend.fit.lift import gain_with_density, shared_out
 from backend.fit.limits import warn_of_substeps
+from backend.fit.population import is_in_image
 from backend.fit.scene import Scene, make_scene
 from backend.fit.series import Series
 from backend.fit.state import PhysicalRecord, VolumeRecord
@@ -103,15 +104,15 @@ class _Fit:
             return self.supply.with_births(record, frame)
         before, after = self.depths.guide(frame - 1), self.depths.guide(frame)
         if before is not None and after is not None:
-            current = self._led(record, before, after)
+            current = self._led(record, before, after, self.scene.views[frame])
         else:
             current = self._filtered(record, frame)
         return self.supply.with_births(self.supply.weighed(current, frame), frame)
 
-    def _led(self, record: PhysicalRecord, before: Guide, after: Guide) -> PhysicalRecord:
-        """Moved as the volumes say, and a share of the way to their density."""
+    def _led(self, record: PhysicalRecord, before: Guide, after: Guide, view: View) -> PhysicalRecord:
+        """Moved as the volumes say, and where the picture shows them a share of the way to their density."""
         positions = before.carried(record.positions, after, seconds=self.scene.seconds_per_frame)
-        positions = drawn_near(after, positions, record.masses)
+        positions = drawn_near(after, positions, record.masses, is_in_image(positions, view))
         velocities = after.velocity_at(positions).astype(np.float64)
         gain = gain_with_density(after.density, after.velocity)
         learned = self._learn_buoyancy(record, velocities, np.ones(len(positions)), substeps=1, gain=gain)

@@ -13,7 +13,7 @@ from backend.contract.cameras import Cameras
 from backend.contract.job import VisualConfig
 from backend.field.rays import optical_depth as optical_depth_of
 from backend.fit import depth_prior, explain, image_motion
-from backend.fit.appearance import Appearance
+from backend.fit.appearance import FADES, Appearance
 from backend.fit.depths import Depths
 from backend.fit.foot import foot_point
 from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
@@ -139,6 +139,33 @@ def test_smoke_that_a_volume_has_far_behind_stays_there() -> None:
     is_far = record.positions[:, 1] > 2.5
     found = record.optical_masses[is_far].sum() / record.optical_masses.sum()
     assert found == pytest.approx(wanted, rel=0.4)  # faint densities weigh less in every balance; a quarter was left of it
+
+
+def test_smoke_that_has_left_the_picture_goes_on_and_fades_with_its_way() -> None:
+    """A volume that has nothing beside the picture takes nothing away there; particles in the picture follow it as before."""
+    scene = make_scene([layer_of(disc(20.0))], cameras())
+    stand = stand_before(scene.views[0], np.zeros(3), voxel_size=0.35, shape=(40, 24, 40))
+    ball = np.exp(-0.5 * np.square(stand.centres()).sum(-1)).astype(np.float32)
+    volume = VolumeRecord(
+        density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
+    )
+    layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
+    appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, Depths(scene, layers, [volume]))
+    record, _ = appearance.look(appearance.empty(), 0)
+    count, steps = len(record.positions), np.array([0.0, 0.5, 1.0, 2.0])
+    beside = np.array([[-5.3, 0.0, 0.0]] * 4)  # half a metre beside the left edge, which is 4.8 m from the middle
+    step = steps * FADES * 96 / 100 * 10  # m in a frame, at 10 m
+    born = {"scales": [0.05] * 4, "colors": [[0.5] * 3] * 4, "born": [0] * 4, "optical_masses": [appearance.unit_mass] * 4}
+    born |= {"positions": beside, "velocities": np.outer(step * 20.0, [0.0, 0.0, 1.0])}
+    if record.rotations is not None:
+        born["rotations"] = [[1.0, 0.0, 0.0, 0.0]] * 4
+    joined = join(record, **{name: np.asarray(values) for name, values in born.items()})
+    found, _ = appearance.look(joined, 0)
+    places = np.flatnonzero(found.ids >= joined.ids[count])
+    np.testing.assert_array_equal(found.positions[places[:4]], beside)
+    masses = found.optical_masses[places[:4]]
+    np.testing.assert_allclose(masses / masses[0], 0.5**steps, rtol=1e-5)
+    assert masses[0] == pytest.approx(joined.optical_masses[count], rel=0.3)  # none fades where it stands
 
 
 def test_flow_gives_the_displacement_in_metres() -> None:

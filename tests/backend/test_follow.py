@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.fit.follow import MOST_RATIO, Balance, drawn_level, points_on_rays
+from backend.fit.follow import MOST_RATIO, Balance, drawn_level, drawn_near, points_on_rays
 from backend.fit.guide import Guide
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
@@ -45,7 +45,7 @@ def test_beside_the_grid_nobody_moves_or_grows() -> None:
     assert balance.ratios()[0] == pytest.approx(MOST_RATIO)
     np.testing.assert_array_equal(balance.ratios()[1:], 1.0)
     np.testing.assert_array_equal(balance.displacement()[1:], 0.0)
-    np.testing.assert_array_equal(drawn_level(guide, points, masses)[1:], masses[1:])
+    np.testing.assert_array_equal(drawn_level(guide, points, masses, np.ones(3, bool))[1:], masses[1:])
 
 
 def test_the_volume_asks_for_what_particles_lack() -> None:
@@ -82,6 +82,24 @@ def test_a_cloud_in_its_volume_stays() -> None:
     moved = Balance(guide_of(MIDDLE), points, np.full(len(points), 3.0)).displacement()
     assert np.abs(moved.mean(axis=0)).max() < 0.02
     assert np.median(np.linalg.norm(moved, axis=1)) < 0.08
+
+
+def test_who_is_not_led_stays_and_does_not_count() -> None:
+    """A second cloud where the volume has nothing: led, it would be pulled over and thinned out."""
+    guide = guide_of(MIDDLE)
+    own, other = cloud(MIDDLE + np.array([0.6, 0.0, 0.0]), 1.2, 4000), cloud(MIDDLE - np.array([3.0, 0.0, 0.0]), 0.5, 1000)
+    points, masses = np.concatenate([own, other]), np.full(5000, guide.density.sum() * VOLUME / 4000, np.float32)
+    is_led = np.arange(5000) < 4000
+    moved, heavier = drawn_near(guide, points, masses, is_led), drawn_level(guide, points, masses, is_led)
+    np.testing.assert_array_equal(moved[~is_led], other)
+    np.testing.assert_array_equal(heavier[~is_led], masses[~is_led])
+    np.testing.assert_array_equal(moved[is_led], drawn_near(guide, own, masses[is_led], is_led[is_led]))
+    np.testing.assert_array_equal(heavier[is_led], drawn_level(guide, own, masses[is_led], is_led[is_led]))
+    assert np.abs(moved[is_led] - own).max() > 0.1
+    assert heavier.dtype == np.float32
+    all_led = np.ones(5000, bool)
+    assert drawn_near(guide, points, masses, all_led)[~is_led, 0].mean() > other[:, 0].mean() + 0.05
+    assert drawn_level(guide, points, masses, all_led)[~is_led].mean() < 0.5 * masses[0]
 
 
 def test_no_smoke_moves_nobody() -> None:
