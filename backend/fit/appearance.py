@@ -31,8 +31,8 @@ RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in 
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
-FADES = 0.013  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
+FADES = 0.013  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
 
 
 class Appearance:

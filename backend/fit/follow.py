@@ -79,9 +79,9 @@ def drawn_near(guide: Guide, positions: np.ndarray, masses: np.ndarray, is_led: 
 def drawn_level(guide: Guide, positions: np.ndarray, masses: np.ndarray, is_led: np.ndarray) -> np.ndarray:
     """Masses [N] m^2 at positions [N, 3] m brought to the volume's density, those that are led, see above; of the type that
     they had."""
-    exact = masses[is_led].astype(np.float64)
+    led, exact = positions[is_led], masses[is_led].astype(np.float64)
     for _ in range(_ROUNDS):
-        exact = exact * Balance(guide, positions[is_led], exact).ratios()
+        exact = exact * Balance(guide, led, exact).ratios()
     levelled = masses.copy()
     levelled[is_led] = exact
     return levelled
