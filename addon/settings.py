@@ -174,7 +174,7 @@ class WILDSMOKE_PG_visual(bpy.types.PropertyGroup):
     """Gaussians: what the smoke looks like."""
 
     num_particles: IntProperty(
-        name="Particles", description="Visual particles, at most, in any frame", default=6000, min=8, max=10_000_000
+        name="Particles", description="Visual particles that a picture shows, at most", default=6000, min=8, max=10_000_000
     )
     iterations: IntProperty(name="Iterations", description="Optimiser steps in each frame", default=6, min=0, max=10_000)
     mass_iterations: IntProperty(
@@ -242,7 +242,7 @@ class WILDSMOKE_PG_published(bpy.types.PropertyGroup):
     num_physical: IntProperty(
         name="Physical Particles", description="In the frame that shows most smoke", default=1500, min=8, max=1_000_000
     )
-    num_particles: IntProperty(name="Particles", description="At most, in any frame", default=6000, min=8, max=10_000_000)
+    num_particles: IntProperty(name="Particles", description="That a picture shows, at most", default=6000, min=8, max=10_000_000)
     physical_iterations: IntProperty(
         name="Physical Iterations", description="Optimiser steps in a frame, of the motion", default=12, min=0, max=10_000
     )

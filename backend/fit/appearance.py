@@ -32,7 +32,8 @@ FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones m
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
-FADES = 0.013  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
+FADES = 0.3  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
+WIDENS = 0.3  # of its way beside the picture: by so much a particle widens there
 
 
 class Appearance:
@@ -79,13 +80,13 @@ class Appearance:
         config, view, layer = self.config, self.scene.views[frame], self.layers[frame]
         target = optical_depth(layer)
         guide = self.depths.guide(frame)
-        is_led = is_in_image(record.positions, view)
+        is_seen = is_in_image(record.positions, view)
         if guide is not None:
-            record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses, is_led))
-        record = self._calmed(record, layer, view)
+            record = replace(record, positions=drawn_near(guide, record.positions, record.optical_masses, is_seen))
+        record = self._calmed(self._doubted(record, ~is_seen, view), layer, view, is_seen)
         if guide is not None:
-            masses = np.where(is_led, record.optical_masses, self._faded(record, view))
-            record = replace(record, optical_masses=drawn_level(guide, record.positions, masses, is_led))
+            masses = drawn_level(guide, record.positions, record.optical_masses, is_seen)
+            record = replace(record, optical_masses=masses)
         else:
             prior = self.depths.prior(frame)
             record = replace(record, positions=depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH))
@@ -96,16 +97,17 @@ class Appearance:
             return record, 0.0
         return refine(record, layer, view, iterations=config.iterations, reference_scale=self.scale, hue=self.hue)
 
-    def _faded(self, record: VisualRecord, view: View) -> np.ndarray:
-        """Masses [N] of particles that go on beside the picture: the further, the less is known of them, and smoke in a wrong
-        place is worse than none."""
+    def _doubted(self, record: VisualRecord, is_beside: np.ndarray, view: View) -> VisualRecord:
+        """Wider and fainter by the way of the last frame where no picture showed it: the further, the less is known of it."""
+        ways = np.where(is_beside, self.scene.seconds_per_frame * np.linalg.norm(record.velocities, axis=1), 0.0)
         _, away = view.project(record.positions)
-        step = self.scene.seconds_per_frame * np.linalg.norm(record.velocities, axis=1)
-        sides = step * view.fx / np.maximum(np.abs(away), 1e-12) / max(view.width, view.height)
-        return record.optical_masses * 0.5 ** (sides / FADES).astype(np.float32)
+        sides = ways * view.fx / np.maximum(np.abs(away), 1e-12) / max(view.width, view.height)
+        wider = (WIDENS * ways).astype(np.float32).reshape(-1, *[1] * (record.scales.ndim - 1))
+        masses = record.optical_masses * 0.5 ** (sides / FADES).astype(np.float32)
+        return replace(record, scales=record.scales + wider, optical_masses=masses)
 
-    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View) -> VisualRecord:
-        """What one view cannot tell shrinks back: masses to their common size, colours to what their pixel shows.
+    def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, is_seen: np.ndarray) -> VisualRecord:
+        """What one view cannot tell shrinks back: masses to their common size where it shows them, colours to their pixel's.
 
         Behind the surface of thick smoke nothing holds single particles, and noise would gather in them from frame to
         frame. The fit that follows restores what the view does tell.
@@ -114,7 +116,7 @@ class Appearance:
             return record
         masses = record.optical_masses.astype(np.float64)
         common = float(np.exp(np.mean(np.log(np.maximum(masses, 1e-3 * self.unit_mass)))))
-        calmed = masses ** (1.0 - CALM_MASS) * common**CALM_MASS
+        calmed = np.where(is_seen, masses ** (1.0 - CALM_MASS) * common**CALM_MASS, masses)
         pixels, _ = view.project(record.positions)
         columns = np.clip(pixels[:, 0].astype(np.int64), 0, view.width - 1)
         rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
@@ -139,19 +141,20 @@ class Appearance:
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 
-    def _with_room(self, record: VisualRecord, wanted: int) -> VisualRecord:
-        """Without its faintest particles, if the limit leaves no room for those wanted: a source must go on emitting."""
-        lacking = wanted - (self.config.num_particles - len(record.positions))
+    def _with_room(self, record: VisualRecord, view: View, wanted: int) -> VisualRecord:
+        """Without the faintest that are shown, if the limit leaves no room for those wanted: a source must go on emitting."""
+        shown = np.flatnonzero(is_in_image(record.positions, view))
+        lacking = wanted - (self.config.num_particles - len(shown))
         if lacking <= 0:
             return record
-        order = np.argsort(record.optical_masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(record.positions)))]
-        is_faint = record.optical_masses[order] < FAINT_SHARE * self.unit_mass
+        masses = record.optical_masses[shown]
+        order = np.argsort(masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(shown)))]
         is_kept = np.ones(len(record.positions), bool)
-        is_kept[order[is_faint]] = False
+        is_kept[shown[order[masses[order] < FAINT_SHARE * self.unit_mass]]] = False
         return take(record, is_kept)
 
     def with_births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
-        """Gaussians for the smoke that nobody explains; at most as many as the limit allows."""
+        """Gaussians for the smoke that nobody explains; the picture shows at most as many as the limit allows."""
         view, layer = self.scene.views[frame], self.layers[frame]
         splat = renderer.forward(as_gaussians(record), view)
         missing = explain.missing_depth(splat, target)
@@ -161,8 +164,8 @@ class Appearance:
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))
         wanted = int(total / unit)
-        record = self._with_room(record, wanted)
-        count = min(wanted, self.config.num_particles - len(record.positions))
+        record = self._with_room(record, view, wanted)
+        count = min(wanted, self.config.num_particles - int(is_in_image(record.positions, view).sum()))
         seed = self.seed + 104729 * frame + 1
         points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=seed)
         guide, count = self.depths.guide(frame), len(points)

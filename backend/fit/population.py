@@ -12,7 +12,7 @@ from backend.fit.scene import Scene, optical_depth
 from backend.fit.state import PhysicalRecord, VisualRecord
 from backend.geometry.camera import View
 
-MARGIN = 0.15  # share of the image around it in which particles live on unseen
+MARGIN = 0.4  # share of the image around it in which particles live on unseen
 PER_PARTICLE = {"positions", "velocities", "masses", "optical_masses", "scales", "rotations", "colors", "ids", "born"}
 
 AnyRecord = TypeVar("AnyRecord", PhysicalRecord, VisualRecord)

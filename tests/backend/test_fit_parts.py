@@ -13,7 +13,7 @@ from backend.contract.cameras import Cameras
 from backend.contract.job import VisualConfig
 from backend.field.rays import optical_depth as optical_depth_of
 from backend.fit import depth_prior, explain, image_motion
-from backend.fit.appearance import FADES, Appearance
+from backend.fit.appearance import FADES, WIDENS, Appearance
 from backend.fit.depths import Depths
 from backend.fit.foot import foot_point
 from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
@@ -141,7 +141,7 @@ def test_smoke_that_a_volume_has_far_behind_stays_there() -> None:
     assert found == pytest.approx(wanted, rel=0.4)  # faint densities weigh less in every balance; a quarter was left of it
 
 
-def test_smoke_that_has_left_the_picture_goes_on_and_fades_with_its_way() -> None:
+def test_smoke_that_has_left_the_picture_goes_on_widens_and_fades_with_its_way() -> None:
     """A volume that has nothing beside the picture takes nothing away there; particles in the picture follow it as before."""
     scene = make_scene([layer_of(disc(20.0))], cameras())
     stand = stand_before(scene.views[0], np.zeros(3), voxel_size=0.35, shape=(40, 24, 40))
@@ -150,22 +150,36 @@ def test_smoke_that_has_left_the_picture_goes_on_and_fades_with_its_way() -> Non
         density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
     )
     layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
-    appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, Depths(scene, layers, [volume]))
+    config = VisualConfig(num_particles=2000, iterations=0)
+    appearance = Appearance(scene, layers, config, 0, Depths(scene, layers, [volume]))
     record, _ = appearance.look(appearance.empty(), 0)
-    count, steps = len(record.positions), np.array([0.0, 0.5, 1.0, 2.0])
-    beside = np.array([[-5.3, 0.0, 0.0]] * 4)  # half a metre beside the left edge, which is 4.8 m from the middle
-    step = steps * FADES * 96 / 100 * 10  # m in a frame, at 10 m
-    born = {"scales": [0.05] * 4, "colors": [[0.5] * 3] * 4, "born": [0] * 4, "optical_masses": [appearance.unit_mass] * 4}
-    born |= {"positions": beside, "velocities": np.outer(step * 20.0, [0.0, 0.0, 1.0])}
+    count, steps = len(record.positions), np.array([0.0, 0.1, 0.2, 0.4])  # m in a frame
+    beside = np.array([[-6.3, 0.0, 0.0]] * 4)  # a metre and a half beside the left edge, which is 4.8 m from the middle
+    masses = appearance.unit_mass * np.array([0.1, 0.5, 2.0, 10.0])
+    born = {"scales": [0.05] * 4, "colors": [[0.5] * 3] * 4, "born": [0] * 4, "optical_masses": masses}
+    born |= {"positions": beside, "velocities": np.outer(steps * 20.0, [0.0, 0.0, 1.0])}
     if record.rotations is not None:
         born["rotations"] = [[1.0, 0.0, 0.0, 0.0]] * 4
     joined = join(record, **{name: np.asarray(values) for name, values in born.items()})
     found, _ = appearance.look(joined, 0)
-    places = np.flatnonzero(found.ids >= joined.ids[count])
-    np.testing.assert_array_equal(found.positions[places[:4]], beside)
-    masses = found.optical_masses[places[:4]]
-    np.testing.assert_allclose(masses / masses[0], 0.5**steps, rtol=1e-5)
-    assert masses[0] == pytest.approx(joined.optical_masses[count], rel=0.3)  # none fades where it stands
+    places = np.flatnonzero(found.ids >= joined.ids[count])[:4]
+    np.testing.assert_array_equal(found.positions[places], beside)
+    np.testing.assert_allclose(found.scales[places].reshape(4, -1)[:, 0], 0.05 + WIDENS * steps, rtol=1e-5)
+    fainter = 0.5 ** (steps * 10.0 / 96.0 / FADES)  # 10 px to a metre
+    np.testing.assert_allclose(found.optical_masses[places], fainter * masses, rtol=1e-5)  # none goes back to the usual mass
+
+
+def test_smoke_beside_the_picture_takes_nobodys_place() -> None:
+    """The limit counts what the picture shows: a source goes on emitting while much of its smoke is beside the picture."""
+    layer = layer_of(disc(20.0))
+    scene = make_scene([layer], cameras())
+    appearance = Appearance(scene, [layer], VisualConfig(num_particles=100, iterations=0), 0)
+    alone, _ = appearance.look(appearance.empty(), 0)
+    away = replace(alone, positions=alone.positions - (5.3, 0.0, 0.0), next_id=np.asarray(1000))
+    away = take(away, alone.positions[:, 0] < 0.0)
+    target = optical_depth(layer)
+    both = appearance.with_births(away, 0, target)
+    assert len(both.positions) - len(away.positions) == len(alone.positions) == 100
 
 
 def test_flow_gives_the_displacement_in_metres() -> None:
@@ -301,7 +315,7 @@ def test_a_frames_mass_is_its_optical_depth_times_the_area() -> None:
 
 def test_who_is_near_the_image() -> None:
     view: View = view_at(cameras(), 0)
-    points = np.array([[0.0, 0, 0], [5.5, 0, 0], [7.0, 0, 0], [0.0, -20.0, 0.0]])
+    points = np.array([[0.0, 0, 0], [8.0, 0, 0], [9.0, 0, 0], [0.0, -20.0, 0.0]])
     np.testing.assert_array_equal(is_near_image(points, view), [True, True, False, False])
 
 
