@@ -31,7 +31,7 @@ RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in 
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
 CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
-CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where that shows no smoke
+CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where no pixel shows smoke
 FADES = 0.3  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
 WIDENS = 0.3  # of its way beside the picture: by so much a particle widens there
 
@@ -107,7 +107,7 @@ class Appearance:
         return replace(record, scales=record.scales + wider, optical_masses=masses)
 
     def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, is_seen: np.ndarray) -> VisualRecord:
-        """What one view cannot tell shrinks back: masses to their common size where it shows them, colours to their pixel's.
+        """What one view cannot tell shrinks back: masses to their common size where it shows them, colours to what it shows.
 
         Behind the surface of thick smoke nothing holds single particles, and noise would gather in them from frame to
         frame. The fit that follows restores what the view does tell.
@@ -122,7 +122,7 @@ class Appearance:
         rows = np.clip(pixels[:, 1].astype(np.int64), 0, view.height - 1)
         seen, opacity = layer[rows, columns, :3], layer[rows, columns, 3:]
         usual = layer[..., :3].sum(axis=(0, 1)) / max(float(layer[..., 3].sum()), 1e-6)
-        shown = np.where(opacity > 0.05, seen / np.maximum(opacity, 0.02), usual)
+        shown = np.where(is_seen[:, None] & (opacity > 0.05), seen / np.maximum(opacity, 0.02), usual)
         colors = (1.0 - CALM_COLOR) * record.colors + CALM_COLOR * shown
         return replace(record, optical_masses=calmed.astype(np.float32), colors=colors.astype(np.float32))
 
