@@ -148,10 +148,10 @@ class PhysicalConfig:
 class VisualConfig:
     """Gaussians: what the smoke looks like.
 
-    num_particles: at most that a frame's picture shows; more may be beside it. iterations: optimiser steps a frame.
-    mass_iterations: multiplicative updates of the optical masses a frame. consistency: pull towards the optical masses
-    carried from the previous frame, 0 to 1. color: "full" fits three channels, "one_hue" only how bright the clip's one
-    hue is; "auto" looks at the clip which will do.
+    num_particles: none is born where a frame's picture shows as many; more may be beside it, and come back. iterations:
+    optimiser steps a frame. mass_iterations: multiplicative updates of the optical masses a frame. consistency: pull
+    towards the optical masses carried from the previous frame, 0 to 1. color: "full" fits three channels, "one_hue" only
+    how bright the clip's one hue is; "auto" looks at the clip which will do.
     """
 
     num_particles: int = 6000
@@ -172,7 +172,7 @@ class VisualConfig:
 class PublishedConfig:
     """The published methods, where `method` names one; the sections physical and visual then have no say.
 
-    num_physical: physical particles in the frame that shows most smoke. num_particles: Gaussians, at most that a picture shows.
+    num_physical: physical particles in the frame that shows most smoke. num_particles: as in VisualConfig.
     physical_iterations, visual_iterations: optimiser steps a frame. first_frame_factor: times as many in the first one.
     solver_iterations: density projections a substep. buoyancy: upwards, m/s^2; what is kept, or where learning starts.
     surface_drag: where smoke borders on air, 1/s. viscosity: how fast neighbours' velocities become equal, 1/s.

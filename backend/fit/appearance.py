@@ -102,9 +102,8 @@ class Appearance:
         ways = np.where(is_beside, self.scene.seconds_per_frame * np.linalg.norm(record.velocities, axis=1), 0.0)
         _, away = view.project(record.positions)
         sides = ways * view.fx / np.maximum(np.abs(away), 1e-12) / max(view.width, view.height)
-        wider = (WIDENS * ways).astype(np.float32).reshape(-1, *[1] * (record.scales.ndim - 1))
-        masses = record.optical_masses * 0.5 ** (sides / FADES).astype(np.float32)
-        return replace(record, scales=record.scales + wider, optical_masses=masses)
+        scales = record.scales + (WIDENS * ways).astype(np.float32)
+        return replace(record, scales=scales, optical_masses=record.optical_masses * 0.5 ** (sides / FADES).astype(np.float32))
 
     def _calmed(self, record: VisualRecord, layer: np.ndarray, view: View, is_seen: np.ndarray) -> VisualRecord:
         """What one view cannot tell shrinks back: masses to their common size where it shows them, colours to what it shows.
@@ -141,20 +140,22 @@ class Appearance:
         is_kept = (masses > DEATH_SHARE * self.unit_mass) & is_near_image(record.positions, view)
         return take(replace(record, optical_masses=masses), is_kept)
 
-    def _with_room(self, record: VisualRecord, view: View, wanted: int) -> VisualRecord:
-        """Without the faintest that are shown, if the limit leaves no room for those wanted: a source must go on emitting."""
+    def _with_room(self, record: VisualRecord, view: View, wanted: int) -> tuple[VisualRecord, int]:
+        """Without the faintest that are shown, if the limit leaves no room for those wanted: a source must go on emitting; and
+        for how many of them there is room, none at all where more came back into the picture than the limit allows."""
         shown = np.flatnonzero(is_in_image(record.positions, view))
         lacking = wanted - (self.config.num_particles - len(shown))
         if lacking <= 0:
-            return record
+            return record, wanted
         masses = record.optical_masses[shown]
         order = np.argsort(masses, kind="stable")[: min(lacking, int(RETIRED_SHARE * len(shown)))]
+        retired = shown[order[masses[order] < FAINT_SHARE * self.unit_mass]]
         is_kept = np.ones(len(record.positions), bool)
-        is_kept[shown[order[masses[order] < FAINT_SHARE * self.unit_mass]]] = False
-        return take(record, is_kept)
+        is_kept[retired] = False
+        return take(record, is_kept), max(0, wanted - lacking + len(retired))
 
     def with_births(self, record: VisualRecord, frame: int, target: np.ndarray) -> VisualRecord:
-        """Gaussians for the smoke that nobody explains; the picture shows at most as many as the limit allows."""
+        """Gaussians for the smoke that nobody explains, until the picture shows as many as the limit allows."""
         view, layer = self.scene.views[frame], self.layers[frame]
         splat = renderer.forward(as_gaussians(record), view)
         missing = explain.missing_depth(splat, target)
@@ -164,8 +165,7 @@ class Appearance:
         unit = self.unit_mass if len(record.positions) == 0 else BIRTH_SHARE * self.unit_mass
         total = float(mass.sum(dtype=np.float64))
         wanted = int(total / unit)
-        record = self._with_room(record, view, wanted)
-        count = min(wanted, self.config.num_particles - int(is_in_image(record.positions, view).sum()))
+        record, count = self._with_room(record, view, wanted)
         seed = self.seed + 104729 * frame + 1
         points, pixels = depth_prior.sample_points(missing, count, prior, view, seed=seed)
         guide, count = self.depths.guide(frame), len(points)

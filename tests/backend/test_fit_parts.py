@@ -150,21 +150,18 @@ def test_smoke_that_has_left_the_picture_goes_on_widens_and_fades_with_its_way()
         density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
     )
     layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
-    config = VisualConfig(num_particles=2000, iterations=0)
-    appearance = Appearance(scene, layers, config, 0, Depths(scene, layers, [volume]))
+    appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, Depths(scene, layers, [volume]))
     record, _ = appearance.look(appearance.empty(), 0)
     count, steps = len(record.positions), np.array([0.0, 0.1, 0.2, 0.4])  # m in a frame
     beside = np.array([[-6.3, 0.0, 0.0]] * 4)  # a metre and a half beside the left edge, which is 4.8 m from the middle
     masses = appearance.unit_mass * np.array([0.1, 0.5, 2.0, 10.0])
     born = {"scales": [0.05] * 4, "colors": [[0.5] * 3] * 4, "born": [0] * 4, "optical_masses": masses}
     born |= {"positions": beside, "velocities": np.outer(steps * 20.0, [0.0, 0.0, 1.0])}
-    if record.rotations is not None:
-        born["rotations"] = [[1.0, 0.0, 0.0, 0.0]] * 4
     joined = join(record, **{name: np.asarray(values) for name, values in born.items()})
     found, _ = appearance.look(joined, 0)
     places = np.flatnonzero(found.ids >= joined.ids[count])[:4]
     np.testing.assert_array_equal(found.positions[places], beside)
-    np.testing.assert_allclose(found.scales[places].reshape(4, -1)[:, 0], 0.05 + WIDENS * steps, rtol=1e-5)
+    np.testing.assert_allclose(found.scales[places], 0.05 + WIDENS * steps, rtol=1e-5)
     fainter = 0.5 ** (steps * 10.0 / 96.0 / FADES)  # 10 px to a metre
     np.testing.assert_allclose(found.optical_masses[places], fainter * masses, rtol=1e-5)  # none goes back to the usual mass
 
@@ -180,6 +177,9 @@ def test_smoke_beside_the_picture_takes_nobodys_place() -> None:
     target = optical_depth(layer)
     both = appearance.with_births(away, 0, target)
     assert len(both.positions) - len(away.positions) == len(alone.positions) == 100
+    back = replace(both, positions=both.positions + np.outer(both.positions[:, 0] < -4.8, (5.3, 0.0, 0.0)))
+    seen = appearance.with_births(back, 0, 3.0 * target)
+    assert 100 < len(seen.positions) <= len(back.positions)  # what comes back is kept, and nobody is born
 
 
 def test_flow_gives_the_displacement_in_metres() -> None:
