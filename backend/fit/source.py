@@ -8,6 +8,7 @@ and so the foot is not asked for more, but where its word is all there is: of a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -31,6 +32,9 @@ _APART = 12 / 128  # of the smoke's extent: sources that are nearer are one
 _HALF = 0.5  # of the smoke at a source: the foot is where there is less below it
 _TOO_HIGH = 0.1  # of the distance, above the foot of all smoke: what stands out there has left a source that is out
 _CLIMBS = 9
+_ALONG, _STEPS = 0.2, 81  # of the distance, along the view to either side, and places there, among which it may lie in depth
+_SURELY = 0.012  # of a frame's largest optical depth, that e-folds less likely places stand out less; tuned on 20 plumes
+_KNOWN = 0.01  # of the distance: depth that is known as well is where smoke stands out most
 _DOWN = 0.1  # of the distance, that it is looked for below
 _ROW = 1024  # points looked up in a row: OpenCV's pictures are not longer than 32767
 _AGAINST = 0.01  # of a frame's largest optical depth, for each e-fold that a place is unlikely by that; tuned on 134 plumes
@@ -43,8 +47,8 @@ def source_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], *
 
     Of many points before the camera the one is found that stands out most (a difference of Gaussians, Marr and Hildreth 1980,
     in the mean over frames), and others that stand out nearly as much. Against a point counts how far it is from where smoke
-    stands before a camera that does not move, which decides where the camera hardly turns. Where nothing stands out, or what
-    does is far above the foot of all smoke, it is that foot.
+    stands before a camera that does not move, which decides where the camera hardly turns. What a short clip leaves open of its
+    depth is answered by the mean. Where nothing stands out, or what does is far above the foot of all smoke, it is that foot.
     """
     frames = np.unique(np.linspace(0, len(views) - 1, most_frames).astype(int))
     views = [views[frame] for frame in frames]
@@ -69,6 +73,7 @@ def source_point(depth_at: Callable[[int], np.ndarray], views: Sequence[View], *
         if not free[best] or values[best] < max(least, 0.0):
             break
         point, value = _climbed(starts[best], seen, usual)
+        point = _expected(point, seen, usual)
         if all(np.linalg.norm(point - other) > apart for other in found):
             found.append(point)
             weights.append(value)
@@ -143,6 +148,18 @@ def _climbed(point: np.ndarray, seen: _Looked, usual: Usual) -> tuple[np.ndarray
         point, value = point + step * around[best], float(values[best])
         step *= 0.5 if best == len(around) // 2 else 0.75
     return point, value
+
+
+def _expected(point: np.ndarray, seen: _Looked, usual: Usual) -> np.ndarray:
+    """The mean of the places along the view through a point that stand out nearly as much: which of them does most is chance
+    where the camera hardly turns."""
+    view = seen.views[len(seen.views) // 2]
+    places = point + np.linspace(-_ALONG, _ALONG, _STEPS)[:, None] * (point - view.position)
+    values = seen.standing_out(places, usual)
+    likely = np.exp((values - values.max()) / _SURELY)
+    mean = likely @ places / likely.sum()
+    spread = math.sqrt(likely @ np.square(places - mean).sum(axis=1) / likely.sum())
+    return mean if spread > _KNOWN * np.linalg.norm(point - view.position) else point
 
 
 def _mean(images: Sequence[np.ndarray], views: Sequence[View], points: np.ndarray) -> np.ndarray:
