@@ -49,7 +49,7 @@ def courant_number(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> float:
 
 def _rate(field: np.ndarray, u: np.ndarray, v: np.ndarray, w: np.ndarray, step: np.float32, rate: np.ndarray) -> float:
     """Fill `rate` with the change over `step`; returns the sum over the sides of what leaves."""
-    _fill_rate(field, u, v, w, step, *_extents(field), rate)
+    _fill_rate(field, u, v, w, step, rate)
     out = 0.0
     for axis, component in enumerate((u, v, w)):
         first, last = np.take(component, 0, axis), np.take(component, -1, axis)
@@ -73,62 +73,32 @@ def _flux(speed, a, b, c, d):
 
 
 @numba.njit(cache=True)
-def _through(speed, far_a, a, b, far_b, is_first, is_last):
-    """Flux through the face between cells a and b. At an open end, where one is missing, smoke leaves and clean air comes in."""
-    if is_first:
-        return min(speed, np.float32(0.0)) * b
-    if is_last:
-        return max(speed, np.float32(0.0)) * a
-    return _flux(speed, far_a, a, b, far_b)
+def _net(before, after, far_a, a, c, b, far_b, is_first, is_last):
+    """Net outflow of cell c along one axis; a and b are its neighbours. Open ends let smoke out and clean air in."""
+    zero = np.float32(0.0)
+    right = max(after, zero) * c if is_last else _flux(after, a, c, b, far_b)
+    left = min(before, zero) * c if is_first else _flux(before, far_a, a, c, b)
+    return right - left
 
 
 @numba.njit(cache=True, parallel=True)
-def _extents(q):
-    """First and last cell [nx, ny] of each column that is not clean air; nz and -1 where all of it is."""
-    nx, ny, nz = q.shape
-    first, last = np.empty((nx, ny), np.int32), np.empty((nx, ny), np.int32)
-    for i in numba.prange(nx):
-        for j in range(ny):
-            low, high = 0, nz - 1
-            while low < nz and q[i, j, low] == 0.0:
-                low += 1
-            while high >= 0 and q[i, j, high] == 0.0:
-                high -= 1
-            first[i, j], last[i, j] = low, high
-    return first, last
-
-
-@numba.njit(cache=True, parallel=True)
-def _fill_rate(q, u, v, w, step, first, last, rate):
-    # Beyond an end the edge cell is repeated, so that both cells beside a face see the same four values there. Nothing flows
-    # where all cells within two are clean air, as most are: those are passed over.
+def _fill_rate(q, u, v, w, step, rate):
+    # Beyond an end the edge cell is repeated, so that both cells beside a face see the same four values there.
     nx, ny, nz = q.shape
     for i in numba.prange(nx):
         i0, i1, i2, i3 = max(i - 2, 0), max(i - 1, 0), min(i + 1, nx - 1), min(i + 2, nx - 1)
-        between = np.zeros(nz, np.float32)  # flux through the faces that a row shares with the one before
         for j in range(ny):
             j0, j1, j2, j3 = max(j - 2, 0), max(j - 1, 0), min(j + 1, ny - 1), min(j + 2, ny - 1)
-            low = min(first[i0, j], first[i1, j], first[i, j], first[i2, j], first[i3, j])
-            low = max(min(low, first[i, j0], first[i, j1], first[i, j2], first[i, j3]) - 2, 0)
-            high = max(last[i0, j], last[i1, j], last[i, j], last[i2, j], last[i3, j])
-            high = min(max(high, last[i, j0], last[i, j1], last[i, j2], last[i, j3]) + 2, nz - 1)
-            rate[i, j] = 0.0
-            between[:low] = 0.0
-            between[high + 1 :] = 0.0
-            below = np.float32(0.0)
-            for k in range(low, high + 1):
+            for k in range(nz):
                 k0, k1, k2, k3 = max(k - 2, 0), max(k - 1, 0), min(k + 1, nz - 1), min(k + 2, nz - 1)
                 c = q[i, j, k]
-                before = _through(u[i, j, k], q[i0, j, k], q[i1, j, k], c, q[i2, j, k], i == 0, False)
-                after = _through(u[i + 1, j, k], q[i1, j, k], c, q[i2, j, k], q[i3, j, k], False, i == nx - 1)
-                total = after - before
-                before = between[k] if j else _through(v[i, 0, k], c, c, c, q[i, j2, k], True, False)
-                after = _through(v[i, j + 1, k], q[i, j1, k], c, q[i, j2, k], q[i, j3, k], False, j == ny - 1)
-                total += after - before
-                between[k] = after
-                if k == low:
-                    below = _through(w[i, j, k], q[i, j, k0], q[i, j, k1], c, q[i, j, k2], k == 0, False)
-                above = _through(w[i, j, k + 1], q[i, j, k1], c, q[i, j, k2], q[i, j, k3], False, k == nz - 1)
-                total += above - below
-                below = above
+                total = _net(
+                    u[i, j, k], u[i + 1, j, k], q[i0, j, k], q[i1, j, k], c, q[i2, j, k], q[i3, j, k], i == 0, i == nx - 1
+                )
+                total += _net(
+                    v[i, j, k], v[i, j + 1, k], q[i, j0, k], q[i, j1, k], c, q[i, j2, k], q[i, j3, k], j == 0, j == ny - 1
+                )
+                total += _net(
+                    w[i, j, k], w[i, j, k + 1], q[i, j, k0], q[i, j, k1], c, q[i, j, k2], q[i, j, k3], k == 0, k == nz - 1
+                )
                 rate[i, j, k] = -step * total
