@@ -41,7 +41,7 @@ _PARTS = {
     "first quarter": (0.0, 0.25),
     "last quarter": (0.75, 1.0),
 }
-_LITTLE = 20.0  # degrees that the camera goes around
+_HARDLY, _LITTLE = 8.0, 20.0  # degrees that the camera goes around
 _WINDY = 0.8  # m/s, and more
 
 
@@ -127,6 +127,7 @@ def main(arguments: list[str]) -> int:
     groups = {
         "whole clips": [parts["whole"] for parts in found.values() if "whole" in parts],
         "all parts": rows,
+        "parts, camera goes less than 8 degrees around": [row for row in rows if row["turned"] < _HARDLY],
         "parts, camera goes less than 20 degrees around": [row for row in rows if row["turned"] < _LITTLE],
         "parts, camera goes further": [row for row in rows if row["turned"] >= _LITTLE],
     }
