@@ -86,6 +86,20 @@ def test_the_page_shows_where_smoke_rises_from() -> None:
             assert f"| {group} | {wind} | {found['clips']} | {cells} |" in page
 
 
+def test_the_page_shows_how_far_off_the_sources_of_short_clips_are() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    results = json.loads((CHECKOUT / "docs" / "results" / "source_errors_short.json").read_text(encoding="utf-8"))
+    for group, kinds in results["summary"].items():
+        if group.startswith("parts, camera goes "):
+            title = group.removeprefix("parts, camera goes ").removesuffix(" around").replace("further", "more")
+            found = kinds["all"]
+            (line,) = (line for line in page.splitlines() if line.startswith(f"| {title} | {found['clips']} | "))
+            cells = line.split(" | ")
+            assert float(cells[2]) == pytest.approx(found["foot, mean"], abs=0.006)
+            assert float(cells[4]) == pytest.approx(found["source, mean"], abs=0.006)
+            assert cells[6] == f"{100 * found['source, beyond 1 m']:.0f} % |"
+
+
 def test_the_page_shows_what_levels_cost() -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     results = json.loads((CHECKOUT / "docs" / "results" / "depth_levels.json").read_text(encoding="utf-8"))
