@@ -117,6 +117,11 @@ class WILDSMOKE_PG_volume(bpy.types.PropertyGroup):
         description="Ask a network trained on simulated smoke for depth and motion; else the images tell alone",
         default=True,
     )
+    as_deep_as_wide: BoolProperty(
+        name="As Deep as Wide",
+        description="How deep smoke is says its silhouette, not the network; for cameras that stand still",
+        default=False,
+    )
     stride: IntProperty(
         name="Stride",
         description="Frames between the images that it compares; 0 finds it from the motion",

@@ -220,7 +220,10 @@ class Pipeline:
             settings = self.config.volume
             with open_stage_file(self.folder.smoke) as file:
                 layers, cameras = FrameStack(file, "smoke"), read_cameras(self.folder.cameras)
-                plan = volume.make_plan(layers, cameras, stride=settings.stride, every=settings.every, finer=settings.finer)
+                plan = volume.make_plan(
+                    layers, cameras, stride=settings.stride, every=settings.every, finer=settings.finer,
+                    as_wide=settings.as_deep_as_wide,
+                )  # fmt: skip
             parts = RecordFolder(self.folder.volume.with_suffix(".parts"), mark, VolumeRecord)
             if plan is None:
                 write_records(self.folder.volume, mark, ())
@@ -273,6 +276,7 @@ class Pipeline:
                 records = visual.run(
                     layers, read_cameras(self.folder.cameras), fluid, self.config.visual, report, seed=self.config.seed,
                     done=parts, method=self.config.method, published=self.config.published, volumes=volumes,
+                    as_wide=self.config.volume.as_deep_as_wide,
                 )  # fmt: skip
                 _keep(parts, records)
             write_records(self.folder.visual, mark, parts)

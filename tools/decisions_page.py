@@ -38,9 +38,9 @@ def decided() -> list[tuple[str, str, str, str]]:
         ),
         (
             "depth",
-            "the prior, or the silhouette's solid",
+            "what the prior sees, or smoke as deep as it is wide",
             f"the camera goes {math.degrees(LEAST_TURN):.0f} degrees around the smoke or more",
-            "volume.use_prior",
+            "volume.as_deep_as_wide",
         ),
         (
             "color",

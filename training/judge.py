@@ -18,6 +18,7 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,9 +46,9 @@ from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume, read_plume
 from training.samples import lattice_of, truth
 from training.train import held_back
 
-_SIZE = 90, 160  # px
+SIZE = 90, 160  # px
 LIGHT = 0.4  # of opaque smoke, linear
-_SEEN = 120  # frames of a clip
+SEEN = 120  # frames of a clip
 _PRESET = "draft"  # of the particles: the volumes that lead them are every preset's
 _VIEWS = {"nvs_last_db": 0.0, "side_db": 90.0}  # degrees from the first place of the camera
 _FAINT = 20.0  # 1/m, summed over the voxels: a moment with less shows no smoke
@@ -56,14 +57,19 @@ _LEVEL = 0.02  # of the fullest level: those with less are not asked where they 
 
 def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Cameras]:
     """Smoke layers [H, W, 4] of the frames that are seen, in eight bits with noise, and the cameras."""
-    width, height = _SIZE
+    width, height = SIZE
     cameras = orbit_cameras(Orbit(), width=width, height=height, fps=FPS, num_frames=NUM_FRAMES)
+    return filmed_by(plume, cameras, draw), replace(cameras, camera_to_world=cameras.camera_to_world[:SEEN])
+
+
+def filmed_by(plume: Plume, cameras: Cameras, draw: np.random.Generator) -> list[np.ndarray]:
+    """The layers alone."""
     layers = []
-    for frame in range(_SEEN):
+    for frame in range(SEEN):
         opacity = opacity_of(plume, frame, view_at(cameras, frame))
         opacity = np.clip(np.round(255 * opacity + draw.normal(0, 0.5, opacity.shape)), 0, 254) / 255
         layers.append(layer_of(opacity))
-    return layers, replace(cameras, camera_to_world=cameras.camera_to_world[:_SEEN])
+    return layers
 
 
 def layer_of(opacity: np.ndarray) -> np.ndarray:
@@ -81,7 +87,7 @@ def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
     the first place in the last third of the clip and from aside, dB; correlations of density, and of velocity inside smoke; and
     how far the middle of a level lies from the true one in depth, m, root of the mean square over the smoke."""
     rows = []
-    for frame in _moments(plume):
+    for frame in moments(plume):
         guide = Guide(records[frame])
         stand, own = guide.stand, guide.stand.from_world[:3, :3]
         density, velocity = truth(plume, frame, stand)
@@ -94,14 +100,17 @@ def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
     return _means(rows)
 
 
-def judge_particles(plume: Plume, cameras: Cameras, records: list[VisualRecord]) -> dict[str, float]:
-    """As `judge`, of the Gaussians of all frames, on the plume's own voxels; where levels lie is not asked."""
+def judge_particles(
+    plume: Plume, cameras: Cameras, records: list[VisualRecord], *, views: Callable[[int], dict[str, View]] | None = None
+) -> dict[str, float]:
+    """As `judge`, of the Gaussians of all frames, on the plume's own voxels; where levels lie is not asked. views: of a frame,
+    from where it is looked at, in place of `judge`'s."""
     rows = []
-    for frame in _moments(plume):
+    for frame in moments(plume):
         ours = particle_frame(records[frame])
         real = plume.density_at(frame), plume.velocity_at(frame)
         row = _row(smoke_and_motion(ours, lattice_of(plume)), real, axes=camera_axes(view_at(cameras, frame)))
-        for name, view in _views(frame).items():
+        for name, view in (views or _views)(frame).items():
             row[name] = _likeness(picture(ours, view), plume, frame, view)
         rows.append(row)
     return _means(rows)
@@ -121,18 +130,18 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: round(float(np.nanmean([row[name] for row in rows if name in row])), 4) for name in names}
 
 
-def _moments(plume: Plume) -> list[int]:
+def moments(plume: Plume) -> list[int]:
     """The frames that are judged: those with velocities, and with smoke."""
-    return [t for t in range(0, _SEEN, 2 * VELOCITY_EVERY) if plume.density_at(t).sum(dtype=np.float64) > _FAINT]
+    return [t for t in range(0, SEEN, 2 * VELOCITY_EVERY) if plume.density_at(t).sum(dtype=np.float64) > _FAINT]
 
 
 def _views(frame: int) -> dict[str, View]:
     """From where a frame is looked at; from the first place late in the clip alone, when the camera has gone far."""
-    width, height = _SIZE
+    width, height = SIZE
     return {
         name: view_at(still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS), 0)
         for name, degrees in _VIEWS.items()
-        if degrees or frame >= 2 * _SEEN // 3
+        if degrees or frame >= 2 * SEEN // 3
     }
 
 

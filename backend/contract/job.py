@@ -102,12 +102,14 @@ class VolumeConfig:
     """Where in depth the smoke is and how it moves, as a prior trained on simulated smoke proposes it.
 
     use_prior: ask it, where `method` is "default"; else the images and a solid around the silhouette tell alone.
+    as_deep_as_wide: of it count the motion and where in depth smoke lies; how deep it is says its silhouette.
     stride: frames between the images that it compares; 0 finds it from the motion.
     every: frames from one that it is asked about to the next, at most two strides; what lies between is carried along.
     finer: it is asked about parts of the smoke, too, and what becomes of that stands on voxels two thirds as large as its own.
     """
 
     use_prior: bool = True
+    as_deep_as_wide: bool = False
     stride: int = 0
     every: int = 5
     finer: bool = True

@@ -30,7 +30,7 @@ BIRTH_SHARE = 0.35  # newborns are finer than their share of the smoke: they fil
 RETIRED_SHARE = 0.05  # of the particles that may make room for newborn ones in a frame
 FAINT_SHARE = 0.7  # of a particle's own share of the smoke: only fainter ones make room
 CALM_MASS = 0.15  # share of the way to the common mass (in the logarithm) that each goes back, a frame
-CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume is proposed
+CALM_DEPTH = 0.3  # share of what stands out of the solid in depth that is taken back, where no volume says otherwise
 CALM_COLOR = 0.25  # share of the way to the colour of its pixel, or to the frame's where no pixel shows smoke
 FADES = 0.3  # of the picture's longer side: a particle that has gone so far beside it has half its mass (docs/prior.md)
 WIDENS = 0.3  # of its way beside the picture: by so much a particle widens there
@@ -40,9 +40,17 @@ class Appearance:
     """Fits Gaussians to frames of one scene."""
 
     def __init__(
-        self, scene: Scene, layers: Series[np.ndarray], config: VisualConfig, seed: int, depths: Depths | None = None
+        self,
+        scene: Scene,
+        layers: Series[np.ndarray],
+        config: VisualConfig,
+        seed: int,
+        depths: Depths | None = None,
+        *,
+        as_wide: bool = False,  # no smoke is far out of what `depths` says, where these are volumes either
     ) -> None:
         self.scene = scene
+        self.as_wide = as_wide
         self.depths = depths or Depths(scene, layers)
         self.layers = layers
         self.config = config
@@ -87,9 +95,10 @@ class Appearance:
         if guide is not None:
             masses = drawn_level(guide, record.positions, record.optical_masses, is_seen)
             record = replace(record, optical_masses=masses)
-        else:
-            prior = self.depths.prior(frame)
-            record = replace(record, positions=depth_prior.contain(record.positions, prior, view, share=CALM_DEPTH))
+        if guide is None or self.as_wide:
+            held = depth_prior.contain(record.positions, self.depths.prior(frame), view, share=CALM_DEPTH)
+            is_held = is_seen | (guide is None)
+            record = replace(record, positions=np.where(is_held[:, None], held, record.positions))
         record = self._weighed(record, frame, target, consistency=config.consistency)
         record = self.with_births(record, frame, target)
         record = self._weighed(record, frame, target, consistency=0.0)

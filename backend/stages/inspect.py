@@ -27,7 +27,7 @@ KEYS = (  # with which the user decides instead
     "extraction.mode",
     "cameras.mode",
     "frames.working_size",
-    "volume.use_prior",
+    "volume.as_deep_as_wide",
     "visual.color",
     "visual.num_particles",
 )
@@ -84,7 +84,7 @@ def _overruled(decision: Decision, config: Config, chosen: Collection[str]) -> D
 def _word(name: str, value: object) -> str | int:
     """A setting's value as its decision would call it."""
     if isinstance(value, bool):
-        return "prior" if value else "silhouette"
+        return "silhouette" if value else "prior"
     if name == "resolution":
         return f"at most {value} px"
     return value if isinstance(value, (str, int)) else str(value)
@@ -156,16 +156,21 @@ def _resolution(seen: Survey, config: Config) -> Decision:
 
 def _depth(seen: Survey, config: Config) -> Decision:
     degrees, least = math.degrees(seen.turn), math.degrees(LEAST_TURN)
-    asks = seen.turn >= LEAST_TURN
-    shown = f"from {least:.0f} on, the prior sees depth and motion" if asks else f"less than {least:.0f} show no depth"
-    reason = f"The camera goes {degrees:.1f} degrees around the smoke; {shown}."
+    shows = seen.turn >= LEAST_TURN
+    reason = f"The camera goes {degrees:.1f} degrees around the smoke; "
+    if not config.volume.use_prior:
+        reason = "volume.use_prior is off, so images and silhouette tell alone."
+    elif shows:
+        reason += f"from {least:.0f} on, the prior sees depth and motion."
+    else:
+        reason += f"less than {least:.0f} show no depth: the prior sees motion, and smoke is as deep as it is wide."
     return Decision(
         name="depth",
-        value="prior" if asks else "silhouette",
+        value="prior" if shows and config.volume.use_prior else "silhouette",
         reason=reason,
         measured={"turn_degrees": degrees},
-        sets={"volume.use_prior": asks},
-        keys=("volume.use_prior",),
+        sets={"volume.as_deep_as_wide": not shows},
+        keys=("volume.as_deep_as_wide",),
     )
 
 

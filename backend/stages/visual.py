@@ -31,6 +31,7 @@ def run(
     method: str = "default",
     published: PublishedConfig | None = None,  # the settings of the other methods
     volumes: Series[VolumeRecord] | None = None,  # what is proposed for each frame; none: the images alone tell
+    as_wide: bool = False,  # smoke is as deep as it is wide, in the volumes and out of them
 ) -> Iterator[VisualRecord]:
     """Yields the records of the frames behind those that are `done`."""
     if method != "default":
@@ -41,7 +42,7 @@ def run(
         return
     scene = make_scene(layers, cameras)
     depths = Depths(scene, layers, volumes)
-    appearance = Appearance(scene, layers, config, seed, depths)
+    appearance = Appearance(scene, layers, config, seed, depths, as_wide=as_wide)
     first = len(done)
     record = done[first - 1] if first else None
     loss = 0.0

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from backend.contract.cameras import Cameras
+from backend.fit.as_wide import as_deep_as_wide, larger, too_near
 from backend.fit.between import between
 from backend.fit.closer import closer
 from backend.fit.guide import Guide
@@ -44,13 +45,16 @@ _NEAR_ENOUGH = 0.5  # voxels that the middle moves at most in a last round
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """A clip in its upright world. straight [4, 4]: the clip's own to that; stride: frames; seconds: of a frame; asked: the
-    frames that the prior is asked about, the first and the last among them."""
+    frames that the prior is asked about, the first and the last among them; as_wide: smoke is as deep as it is wide; larger:
+    times as large and as far away as the prior says, so that it rises from where it is taken to."""
 
     region: Region
     straight: np.ndarray
     stride: int
     seconds: float
     asked: tuple[int, ...]
+    as_wide: bool = False
+    larger: float = 1.0
 
     @property
     def work(self) -> int:
@@ -104,22 +108,33 @@ class Plan:
 
     def agreed(self, density: np.ndarray, stand: Stand, frame: int) -> np.ndarray:
         """Density [X, Y, Z] 1/m on the voxels of a stand, as the frame shows it."""
-        return agreed(density, stand, *self.region.finer.of(frame))
+        picture, view = self.region.finer.of(frame)
+        if self.as_wide:
+            density = as_deep_as_wide(density, stand, picture, view, self.region.source, finer=self.region.fineness)
+        return agreed(density, stand, picture, view)
 
-    def record(self, proposal: Proposal) -> VolumeRecord:
+    def record(self, proposal: Proposal, frame: int) -> VolumeRecord:
         """In the clip's own world."""
+        if self.larger != 1.0:
+            proposal = larger(proposal, self.region.pictures.views[frame].position, self.larger)
         velocity = proposal.velocity @ self.straight[:3, :3].astype(np.float32)
         return _packed(replace(proposal, velocity=velocity), proposal.stand.from_world @ self.straight)
 
 
 def make_plan(
-    layers: Series[np.ndarray], cameras: Cameras, *, stride: int = 0, every: int = 1, finer: bool = True
+    layers: Series[np.ndarray],
+    cameras: Cameras,
+    *,
+    stride: int = 0,
+    every: int = 1,
+    finer: bool = True,
+    as_wide: bool = False,
 ) -> Plan | None:
     """None of a clip without smoke. layers: [H, W, 4] float32 premultiplied linear RGB and opacity.
 
     stride: frames between the images that are compared; 0: found from the motion. every: frames, at most two strides: the prior
-    is asked so often. finer: on finer voxels than the prior's, looked at closer. The prior knows upright worlds only: the scene
-    is turned upright before it is asked, its answer back.
+    is asked so often. finer: on finer voxels than the prior's, looked at closer. as_wide: smoke is as deep as it is wide. The
+    prior knows upright worlds only: the scene is turned upright before it is asked, its answer back.
     """
     scene = make_scene(layers, cameras)
     straight = upright(up_of(scene.views))
@@ -130,7 +145,7 @@ def make_plan(
         return None
     stride, last = stride or stride_of(region), len(layers) - 1
     asked = (*range(0, last, gap_of(every, stride=stride)), last)
-    return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked)
+    return Plan(region=region, straight=straight, stride=stride, seconds=scene.seconds_per_frame, asked=asked, as_wide=as_wide)
 
 
 def centred(plan: Plan, report: Report, *, prior: Prior, num_done: int = 0, num_workers: int = 0) -> Plan:
@@ -178,15 +193,20 @@ def run(
     plan: Plan, report: Report, proposals: Series[VolumeRecord], *, levels: LevelNet | None, shares: ShareNet | None
 ) -> Iterator[VolumeRecord]:
     """Yields the records of all frames. proposals: what `propose` made of all asked frames; levels, shares: the prior's small
-    networks, None where it has none. That of shares was taught on finer voxels, and needs the other's word."""
+    networks, None where it has none. That of shares was taught on finer voxels, and needs the other's word; where smoke is as
+    deep as it is wide it is not asked."""
     levelling, weighing = levels_of(plan, proposals, levels), None
-    if levelling is not None and shares is not None and plan.region.fineness > 1.0:
+    if levelling is not None and shares is not None and plan.region.fineness > 1.0 and not plan.as_wide:
         weighing = Weighing(region=plan.region, levels=levelling, net=shares)
+    if plan.as_wide:
+        said = ((_unpacked(proposals[index]), frame) for index, frame in enumerate(plan.asked))
+        feet = (each if levelling is None else levelling.levelled(each, frame) for each, frame in said)
+        plan = replace(plan, larger=too_near(feet, plan.region))
     for word in words(plan, proposals, levelling, range(plan.region.num_frames)):
         density = word.sharp
         if weighing is not None:
             density = plan.agreed(weighing.weighed(word.said, word.sharp, word.lasts, word.frame), word.said.stand, word.frame)
-        yield plan.record(replace(word.levelled, density=density))
+        yield plan.record(replace(word.levelled, density=density), word.frame)
         report.progress(plan.work - plan.region.num_frames + word.frame + 1, plan.work)
 
 

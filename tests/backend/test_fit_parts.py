@@ -141,6 +141,30 @@ def test_smoke_that_a_volume_has_far_behind_stays_there() -> None:
     assert found == pytest.approx(wanted, rel=0.4)  # faint densities weigh less in every balance; a quarter was left of it
 
 
+@pytest.mark.parametrize("as_wide", [True, False])
+def test_before_a_still_camera_no_particle_of_the_picture_strays_from_the_volume(as_wide: bool) -> None:
+    scene = make_scene([layer_of(disc(20.0))], cameras())
+    stand = stand_before(scene.views[0], np.zeros(3), voxel_size=0.35, shape=(40, 24, 40))
+    ball = np.exp(-0.5 * np.square(stand.centres()).sum(-1)).astype(np.float32)
+    volume = VolumeRecord(
+        density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
+    )
+    layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
+    depths = Depths(scene, layers, [volume])
+    appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, depths, as_wide=as_wide)
+    record, _ = appearance.look(appearance.empty(), 0)
+    count, strayed = len(record.positions), np.array([[0.2, 3.8, 0.1], [-9.5, 3.8, 0.0]])  # the second beside the picture
+    born = {"scales": [0.2] * 2, "colors": [[0.5] * 3] * 2, "born": [0] * 2, "optical_masses": [appearance.unit_mass] * 2}
+    joined = join(record, positions=strayed, velocities=np.zeros((2, 3)), **{name: np.asarray(of) for name, of in born.items()})
+    names = joined.ids[count : count + 2]
+    for _ in range(8):
+        joined, _ = appearance.look(joined, 0)
+    found = {int(name): place for name, place in zip(joined.ids, joined.positions, strict=True)}
+    inside, beside = (found[int(name)] for name in names)
+    assert (inside[1] < 3.0) == as_wide
+    np.testing.assert_array_equal(beside, strayed[1])
+
+
 def test_smoke_that_has_left_the_picture_goes_on_widens_and_fades_with_its_way() -> None:
     """A volume that has nothing beside the picture takes nothing away there; particles in the picture follow it as before."""
     scene = make_scene([layer_of(disc(20.0))], cameras())

@@ -97,7 +97,8 @@ def test_grey_smoke_on_black(tmp_path) -> None:
     assert values["color"] == "one_hue" and values["resolution"] == "at most 80 px"
     assert found["resolution"].is_overridden and not found["resolution"].sets
     followed = found.followed(Config())
-    assert followed.extraction.mode == "on_black" and followed.visual.color == "one_hue" and not followed.volume.use_prior
+    assert followed.extraction.mode == "on_black" and followed.visual.color == "one_hue" and followed.volume.use_prior
+    assert followed.volume.as_deep_as_wide
     assert all(decision.reason.endswith(".") and decision.keys for decision in found.decisions)
     for decision in found.decisions:
         assert decision.reason in found.to_text() and f"--set {decision.keys[0]}" in found.to_text()
@@ -132,8 +133,8 @@ def test_only_the_frames_that_are_fitted_are_looked_at(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("changes", "name", "value", "sets"),
     [
-        ({"turn": 1.01 * LEAST}, "depth", "prior", {"volume.use_prior": True}),
-        ({"turn": 0.99 * LEAST}, "depth", "silhouette", {"volume.use_prior": False}),
+        ({"turn": 1.01 * LEAST}, "depth", "prior", {"volume.as_deep_as_wide": False}),
+        ({"turn": 0.99 * LEAST}, "depth", "silhouette", {"volume.as_deep_as_wide": True}),
         ({"one_hue_error": 10**-6.5}, "color", "one_hue", {"visual.color": "one_hue"}),
         ({"one_hue_error": 10**-6.3}, "color", "full", {"visual.color": "full"}),
         ({"detail_errors": {0.35: 1e-3, 0.5: 1e-7}}, "resolution", "160 x 90", {"frames.working_size": 160}),
@@ -152,6 +153,12 @@ def test_each_decision_by_hand(changes, name, value, sets) -> None:
     assert override(Config(), decision.sets), "the settings take it"
 
 
+def test_without_the_prior_there_is_its_silhouette_whatever_the_camera_does() -> None:
+    found = inspect.decide(seen(turn=10 * LEAST), override(Config(), {"volume.use_prior": False}), chosen=["volume.use_prior"])
+    assert found["depth"].value == "silhouette" and found["depth"].reason.startswith("volume.use_prior is off")
+    assert not found.followed(override(Config(), {"volume.use_prior": False})).volume.use_prior
+
+
 def test_a_small_wisp_needs_few_particles_and_none_is_never_enough() -> None:
     some = inspect.decide(seen(fullest_share=0.01), preset_config("final"))["particles"]
     assert some.value == round(inspect.PARTICLES_A_PIXEL * 0.01 * 480 * 270) and some.sets == {"visual.num_particles": some.value}
@@ -167,7 +174,7 @@ def test_a_small_wisp_needs_few_particles_and_none_is_never_enough() -> None:
         ("extraction.mode", "matte", "extraction"),
         ("cameras.mode", "still", "camera"),
         ("frames.working_size", 300, "resolution"),
-        ("volume.use_prior", True, "depth"),
+        ("volume.as_deep_as_wide", False, "depth"),
         ("visual.color", "full", "color"),
         ("visual.num_particles", 5000, "particles"),
     ],

@@ -29,7 +29,7 @@ from backend.prior.window import SHAPE, Stand, stand_before
 from backend.reporting import SilentReport
 from backend.stages import volume
 from benchmarks.tilted_scene import tilted, turn
-from synthetic.sweep import Orbit, orbit_cameras
+from synthetic.sweep import Orbit, orbit_cameras, still_cameras
 
 NUM_FRAMES = 6
 ORBIT = Orbit(azimuth_stop=-85.0)
@@ -247,6 +247,23 @@ def test_how_far_a_camera_goes_around_the_smoke() -> None:
     whole = np.radians(abs(ORBIT.azimuth_stop - ORBIT.azimuth_start))
     assert turned_about(scene.views, scene.anchor) == pytest.approx(whole * (NUM_FRAMES - 1) / NUM_FRAMES, rel=0.1)
     assert turned_about(scene.views[:1] * NUM_FRAMES, scene.anchor) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_before_a_still_camera_smoke_is_as_deep_as_wide_wherever_it_is_put(prior: Prior) -> None:
+    still = still_cameras(ORBIT, turned=0.0, width=72, height=128, fps=15.0)
+    still, view = replace(still, camera_to_world=still.camera_to_world * NUM_FRAMES), view_at(still, 0)
+    report, spreads, shown = SilentReport(), {}, {}
+    for as_wide in (False, True):
+        plan = volume.make_plan(layers(), still, stride=1, every=1, as_wide=as_wide)
+        assert plan is not None
+        plan = volume.centred(plan, report, prior=prior)
+        proposals = list(volume.propose(plan, report, prior=prior, done=[]))
+        guide = Guide(list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))[-1])
+        along = (guide.stand.centres() @ view.camera_to_world[:3, 2]).ravel()
+        spreads[as_wide] = float(np.sqrt(np.cov(along, aweights=guide.density.ravel())))
+        shown[as_wide] = optical_depth(guide.density, guide.stand.lattice, guide.stand.seen(view))
+    assert spreads[True] < 0.7 * spreads[False], "random weights say smoke everywhere"
+    assert np.abs(shown[True] - shown[False]).max() < 0.15 * shown[False].max(), "the picture's sums along its rays"
 
 
 def test_haze_goes_to_where_most_smoke_is() -> None:

@@ -18,6 +18,7 @@ from backend.io.vdb import openvdb_module
 CHECKOUT = Path(__file__).resolve().parents[2]
 NOT_COMPARED = {"timing.json", "estimate.json", "log.txt", "job.json", "running.json"}
 SMALL = {
+    "volume.use_prior": "false",
     "frames.working_size": "64",
     "physical.num_particles": "150",
     "physical.correction_iterations": "1",

@@ -20,6 +20,7 @@ from backend.contract.decisions import read_decisions
 from backend.contract.errors import BackendError, Cancelled
 from backend.contract.job import Config, Job, override
 from backend.events_out import StopRequest
+from backend.geometry.camera import view_at
 from backend.io.job_folder import JobFolder, fingerprint
 from backend.io.particles import read_particles
 from backend.io.records import read_stamp
@@ -73,7 +74,7 @@ def written(path: Path, *, seed: int) -> Path:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A camera goes around the smoke: one that stands still is not asked for depth."""
+    """A camera goes around the smoke."""
     folder = tmp_path_factory.mktemp("clip")
     orbit = Orbit(azimuth_start=0.0, azimuth_stop=20.0)
     cameras = orbit_cameras(orbit, width=48, height=64, fps=15.0, num_frames=NUM_FRAMES)
@@ -173,15 +174,27 @@ def test_other_weights_make_what_follows_from_them_stale(job: Path, clip: Path, 
         assert read_stamp(folder / "stages" / f"{name}.h5") not in (None, mark, read_stamp(job / "stages" / f"{name}.h5"))
 
 
-def test_a_camera_that_stands_still_is_not_asked_for_depth(clip: Path, weights: Path, plain: Path, tmp_path: Path) -> None:
+def test_smoke_before_a_camera_that_stands_still_is_as_deep_as_wide(clip: Path, weights: Path, tmp_path: Path) -> None:
     cameras = read_cameras(clip.parent / "cameras.json")
     still = replace(cameras, camera_to_world=(cameras.camera_to_world[0],) * NUM_FRAMES)
     (clip.parent / "still").mkdir()
     (clip.parent / "still" / "cameras.json").write_text(still.to_json(), encoding="utf-8")
     (clip.parent / "still" / "plume").symlink_to(clip)
-    heard = run(clip.parent / "still" / "plume", tmp_path / "job", tmp_path / "nowhere.npz", volume__use_prior=None)
-    assert heard.stages(skipped=False) == list(WITHOUT), "nor are its weights"
-    assert read_decisions(tmp_path / "job")["depth"].value == "silhouette"
+    heard = run(clip.parent / "still" / "plume", tmp_path / "job", weights)
+    assert heard.stages(skipped=False) == list(STAGES)
+    decision = read_decisions(tmp_path / "job")["depth"]
+    assert decision.value == "silhouette" and decision.sets == {"volume.as_deep_as_wide": True}
+    drawn_out = run(clip.parent / "still" / "plume", tmp_path / "other", weights, volume__as_deep_as_wide=False)
+    assert drawn_out.stages(skipped=False) == list(STAGES)
+    assert deep(tmp_path / "job") < 0.8 * deep(tmp_path / "other")
+
+
+def deep(job: Path) -> float:
+    """Standard deviation of the last fitted frame's smoke along the view, m."""
+    with read_particles(job / "particles.h5") as particles:
+        frame, view = particles.frame(NUM_FRAMES - 1), view_at(particles.info.cameras, 0)
+        along, masses = view.to_camera(frame.positions)[:, 2], frame.optical_masses.astype(np.float64)
+        return float(np.sqrt(np.average(np.square(along - np.average(along, weights=masses)), weights=masses)))
 
 
 def test_without_the_prior_nothing_changes(plain: Path, clip: Path, tmp_path: Path) -> None:

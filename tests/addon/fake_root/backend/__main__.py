@@ -38,8 +38,8 @@ DECISIONS = {
             "value": "silhouette",
             "reason": "The camera stands still.",
             "measured": {"turn_degrees": 0.0},
-            "sets": {"volume.use_prior": False},
-            "keys": ["volume.use_prior"],
+            "sets": {"volume.as_deep_as_wide": True},
+            "keys": ["volume.as_deep_as_wide"],
             "is_overridden": False,
         }
     ],
