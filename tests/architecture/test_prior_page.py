@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from backend.prior.weights import WEIGHTS, weights_fingerprint
+from training.judge_still import WAYS
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 JUDGED = ("density", "sideways", "up", "depth", "level_m", "nvs_last_db", "side_db")
@@ -98,6 +100,19 @@ def test_the_page_shows_how_far_off_the_sources_of_short_clips_are() -> None:
             assert float(cells[2]) == pytest.approx(found["foot, mean"], abs=0.006)
             assert float(cells[4]) == pytest.approx(found["source, mean"], abs=0.006)
             assert cells[6] == f"{100 * found['source, beyond 1 m']:.0f} % |"
+
+
+def test_the_page_shows_what_is_made_of_a_still_camera() -> None:
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    results = json.loads((CHECKOUT / "docs" / "results" / "still_volumes.json").read_text(encoding="utf-8"))
+    assert results["weights"] == weights_fingerprint()[:12]
+    tuned = set(results["tuned_on"])
+    for title, names in (("tuned on", tuned), ("not tuned on", set(results["plumes"]) - tuned)):
+        for way in WAYS:
+            rows = [results["plumes"][name][way] for name in sorted(names)]
+            digits = {"density": 3, "sideways": 2, "up": 2, "depth": 2, "turned_30_db": 2, "side_db": 2, "back_db": 2}
+            cells = " | ".join(f"{np.mean([row[key] for row in rows]):.{count}f}" for key, count in digits.items())
+            assert f"| {way} | {title}, {len(rows)} | {cells} |" in page
 
 
 def test_the_page_shows_what_levels_cost() -> None:
