@@ -136,12 +136,11 @@ def input_view(*runs: dict[str, Any]) -> list[str]:
         "## Input view, real clips among them\n",
         "`python -m benchmarks.input_view JOB --json FILE`: PSNR in dB of the reconstruction against its own smoke layer, over "
         "the full frame and over the smoke. It says how well what was seen is reproduced, nothing of other angles. The real "
-        "clips went through the add-on's operators (`tests/end_to_end/operators_on_clip.py CLIP FOLDER`), in "
-        "bpy 4.5.\n",
+        "clips went through the add-on's operators (`tests/end_to_end/operators_on_clip.py CLIP FOLDER`), in bpy 4.5.\n",
         table(["clip", "preset", "frames", "extraction", "full frame dB", "smoke dB", "seconds", "warnings"], rows),
         "Seen in their pictures: the stack plume is passed through untouched and stands where it stood; of the wildfire the "
         "plume is kept with soft edges while terrain and sky stay empty, its thin foot along the skyline included, with a few "
-        "bright dashes where the ground shows through; from the side both are as deep as wide, which is what is made of smoke before a camera that stands still.\n",
+        "bright dashes where the ground shows through; from the side both are as deep as wide, for no still camera shows more.\n",
     ]
 
 

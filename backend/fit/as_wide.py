@@ -74,7 +74,8 @@ def as_deep_as_wide(
     along = np.arange(density.shape[1])
     smooth = _SMOOTH * finer
     total = ndimage.gaussian_filter1d(mass, smooth, mode="constant")
-    middle = ndimage.gaussian_filter1d(along @ density.sum(axis=0, dtype=np.float64), smooth, mode="constant") / (total + 1e-9)
+    middle = ndimage.gaussian_filter1d(along @ density.sum(axis=0, dtype=np.float64), smooth, mode="constant")
+    middle /= total + 1e-9 * mass.max()
     chords = inflate(depth, view, source).half_thickness.astype(np.float32) / np.float32(stand.lattice.voxel_size)
     half = at_voxels(chords, stand.lattice, stand.seen(view), outside=float(chords.min()))
     share = (along[:, None] - middle).astype(np.float32) / np.maximum(np.float32(_WIDER) * half, np.float32(_LEAST))
