@@ -18,7 +18,7 @@ from backend.fit.depths import Depths
 from backend.fit.foot import foot_point
 from backend.fit.population import frame_mass, is_near_image, join, not_grown_beside, pixel_mass, take
 from backend.fit.refine import as_gaussians, refine
-from backend.fit.scene import make_scene, optical_depth
+from backend.fit.scene import Scene, make_scene, optical_depth
 from backend.fit.state import VisualRecord, VolumeRecord
 from backend.geometry.camera import View, view_at
 from backend.prior.window import stand_before
@@ -141,8 +141,8 @@ def test_smoke_that_a_volume_has_far_behind_stays_there() -> None:
     assert found == pytest.approx(wanted, rel=0.4)  # faint densities weigh less in every balance; a quarter was left of it
 
 
-@pytest.mark.parametrize("as_wide", [True, False])
-def test_before_a_still_camera_no_particle_of_the_picture_strays_from_the_volume(as_wide: bool) -> None:
+def ball_of_smoke() -> tuple[Scene, VolumeRecord, list[np.ndarray]]:
+    """One frame of it, its volume, and its picture."""
     scene = make_scene([layer_of(disc(20.0))], cameras())
     stand = stand_before(scene.views[0], np.zeros(3), voxel_size=0.35, shape=(40, 24, 40))
     ball = np.exp(-0.5 * np.square(stand.centres()).sum(-1)).astype(np.float32)
@@ -150,6 +150,12 @@ def test_before_a_still_camera_no_particle_of_the_picture_strays_from_the_volume
         density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
     )
     layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
+    return scene, volume, layers
+
+
+@pytest.mark.parametrize("as_wide", [True, False])
+def test_before_a_still_camera_no_particle_of_the_picture_strays_from_the_volume(as_wide: bool) -> None:
+    scene, volume, layers = ball_of_smoke()
     depths = Depths(scene, layers, [volume])
     appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, depths, as_wide=as_wide)
     record, _ = appearance.look(appearance.empty(), 0)
@@ -167,13 +173,7 @@ def test_before_a_still_camera_no_particle_of_the_picture_strays_from_the_volume
 
 def test_smoke_that_has_left_the_picture_goes_on_widens_and_fades_with_its_way() -> None:
     """A volume that has nothing beside the picture takes nothing away there; particles in the picture follow it as before."""
-    scene = make_scene([layer_of(disc(20.0))], cameras())
-    stand = stand_before(scene.views[0], np.zeros(3), voxel_size=0.35, shape=(40, 24, 40))
-    ball = np.exp(-0.5 * np.square(stand.centres()).sum(-1)).astype(np.float32)
-    volume = VolumeRecord(
-        density=ball, velocity=np.zeros((*ball.shape, 3), np.float32), from_world=stand.from_world, voxel_size=np.asarray(0.35)
-    )
-    layers = [layer_of(optical_depth_of(ball, stand.lattice, stand.seen(scene.views[0])))]
+    scene, volume, layers = ball_of_smoke()
     appearance = Appearance(scene, layers, VisualConfig(num_particles=2000, iterations=0), 0, Depths(scene, layers, [volume]))
     record, _ = appearance.look(appearance.empty(), 0)
     count, steps = len(record.positions), np.array([0.0, 0.1, 0.2, 0.4])  # m in a frame

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from true_gaussians import true_gaussians
 
-from backend.fit.state import VisualRecord, VolumeRecord
+from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.window import SHAPE, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.judge import film, judge, judge_particles, levels_off
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 from training.plumes import SIZE, plume
-from training.samples import lattice_of, truth
+from training.samples import truth
 from training.train import held_back
 
 CELL = 0.5  # m
@@ -69,30 +70,9 @@ def test_smoke_too_far_away_is_told_by_how_far(column: Plume) -> None:
     assert moved["sideways"] == right["sideways"]
 
 
-def gaussians(of: Plume, *, shift: float) -> list[VisualRecord]:
-    """One in each voxel of the true smoke, moved by some metres along x."""
-    found, lattice = [], lattice_of(of)
-    for frame in range(0, 120, 2 * VELOCITY_EVERY):
-        density, velocity = of.density_at(frame), of.velocity_at(frame)
-        is_smoke = density > 0.02
-        count = int(is_smoke.sum())
-        record = VisualRecord(
-            positions=lattice.centres()[is_smoke] + np.array([shift, 0.0, 0.0]),
-            velocities=velocity[is_smoke],
-            scales=np.full(count, 0.6 * VOXEL_SIZE, np.float32),
-            optical_masses=(density[is_smoke] * VOXEL_SIZE**3).astype(np.float32),
-            colors=np.full((count, 3), 0.4, np.float32),
-            ids=np.arange(count),
-            born=np.zeros(count, np.int32),
-            next_id=np.asarray(count),
-        )
-        found += [record] * (2 * VELOCITY_EVERY)
-    return found
-
-
 def test_particles_are_judged_as_volumes_are(column: Plume) -> None:
     _, cameras = film(column, np.random.default_rng(0))
-    right, moved = (judge_particles(column, cameras, gaussians(column, shift=shift)) for shift in (0.0, 1.0))
+    right, moved = (judge_particles(column, cameras, true_gaussians(column, shift=shift)) for shift in (0.0, 1.0))
     assert min(right[name] for name in ("density", "sideways", "depth", "up")) > 0.97
     assert min(right["nvs_last_db"], right["side_db"]) > 33.0
     assert moved["density"] < 0.8 * right["density"]

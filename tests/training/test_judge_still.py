@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from true_gaussians import true_gaussians
 
-from backend.fit.state import VisualRecord, particle_frame
+from backend.fit.state import particle_frame
 from backend.geometry.camera import view_at
 from backend.render.picture import picture
 from training import judge_still
 from training.judge import SEEN
 from training.library import NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
 from training.plumes import SIZE, plume
-from training.samples import lattice_of
 
 VIEW = view_at(judge_still._standing(0.0), 0)
 
@@ -33,26 +33,9 @@ def ball() -> Plume:
     )
 
 
-def record_of(ball: Plume) -> VisualRecord:
-    """One Gaussian in each voxel of the true smoke."""
-    density = ball.density_at(0)
-    is_smoke = density > 0.02
-    count = int(is_smoke.sum())
-    return VisualRecord(
-        positions=lattice_of(ball).centres()[is_smoke],
-        velocities=np.zeros((count, 3), np.float32),
-        scales=np.full(count, 0.6 * VOXEL_SIZE, np.float32),
-        optical_masses=(density[is_smoke] * VOXEL_SIZE**3).astype(np.float32),
-        colors=np.full((count, 3), 0.4, np.float32),
-        ids=np.arange(count),
-        born=np.zeros(count, np.int32),
-        next_id=np.asarray(count),
-    )
-
-
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.2])
 def test_smoke_that_is_too_near_is_known_and_made_larger(ball: Plume, factor: float) -> None:
-    right = record_of(ball)
+    right = true_gaussians(ball, shift=0.0)[0]
     wrong = judge_still._larger(right, VIEW, 1 / factor)
     assert judge_still.distance_error(ball, [wrong] * SEEN, VIEW) == pytest.approx(factor, rel=1e-3)
     pictures = [picture(particle_frame(record), VIEW) for record in (right, wrong)]
@@ -63,7 +46,8 @@ def test_smoke_that_is_too_near_is_known_and_made_larger(ball: Plume, factor: fl
 
 
 def test_a_fit_without_smoke_stays_where_it_is(ball: Plume) -> None:
-    nothing = replace(record_of(ball), optical_masses=np.zeros(len(record_of(ball).ids), np.float32))
+    right = true_gaussians(ball, shift=0.0)[0]
+    nothing = replace(right, optical_masses=np.zeros_like(right.optical_masses))
     assert judge_still.distance_error(ball, [nothing] * SEEN, VIEW) == 1.0
 
 
