@@ -27,15 +27,17 @@ DOUBT = 0.8  # of a parcel's way: measured with true velocities on the tuning sc
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trust:
-    """How far a forecast may be trusted. speed: m/s, root mean square; rate: 1/s, at which trust in the motion is lost."""
+    """How far a forecast may be trusted. speed: m/s, root mean square; rate: 1/s, at which trust in the motion is lost;
+    confirmed: how much of it the last frames bear out, 0 to 1."""
 
     speed: float
     rate: float
     spreading: float  # standard deviation of a parcel's way, share of it
+    confirmed: float = 1.0
 
     def share_moved(self, seconds: float) -> float:
         """Of the smoke; the rest stays where it was seen last."""
-        return math.exp(-self.rate * seconds)
+        return self.confirmed * math.exp(-self.rate * seconds)
 
     def growth(self, seconds: float) -> float:
         """m: standard deviation of where moved smoke is."""

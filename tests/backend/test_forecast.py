@@ -22,6 +22,7 @@ from backend.render.picture import picture
 from backend.reporting import SilentReport
 from backend.score.measures import decibels, squared_errors
 from backend.stages import forecast
+from synthetic.sweep import Orbit, orbit_cameras
 
 FPS = 10.0
 UP = np.array([0.0, 0.0, 1.0])
@@ -189,6 +190,45 @@ def test_pure_motion_by_hand() -> None:
         np.testing.assert_allclose(record.positions, start + step / FPS * MOVING, atol=1e-6)
         np.testing.assert_allclose(record.velocities, np.tile(MOVING, (120, 1)), atol=1e-6)
         np.testing.assert_array_equal(record.scales, np.float32(0.2))
+
+
+def resting(velocity: np.ndarray, *, num_frames: int = 12) -> tuple[list[np.ndarray], list[PhysicalRecord], list[VisualRecord]]:
+    """A cloud whose particles are said to move, and whose pictures stay as they are."""
+    seen = [visual(cloud(), np.tile(velocity, (120, 1)))] * num_frames
+    layers = [picture(particle_frame(record), VIEW) for record in seen]
+    return layers, [physical(record.positions, velocity) for record in seen], seen
+
+
+def test_motion_that_no_picture_bears_out_is_not_foretold() -> None:
+    layers, fluid, seen = resting(MOVING)
+    last = run((layers, fluid, seen), PURE)[-1]
+    masses = last.optical_masses.astype(np.float64)
+    at_rest = np.isin(last.ids, seen[-1].ids + seen[-1].next_id)
+    assert masses[at_rest].sum() > 0.9 * masses.sum()
+    foretold = squared_errors(picture(particle_frame(last), VIEW), layers[-1])[0]
+    assert decibels(foretold) > 40.0
+
+
+def test_motion_that_pictures_bear_out_is() -> None:
+    parts = clip(MOVING, num_frames=12)
+    scene = make_scene(parts[0], CAMERAS)
+    assert forecast._confirmed(scene, *parts, None) == 1.0
+    half = [replace(record, velocities=0.25 * record.velocities) for record in parts[1]], parts[2]
+    assert forecast._confirmed(scene, parts[0], *half, None) == 1.0, "slower than it is, it is not less sure"
+    fast = [replace(record, velocities=2.0 * record.velocities) for record in parts[1]], parts[2]
+    assert 0.3 < forecast._confirmed(scene, parts[0], *fast, None) < 0.9
+    assert forecast._confirmed(scene, *(part[:2] for part in parts), None) == 1.0, "two frames tell nothing"
+
+
+def test_before_a_camera_that_moves_it_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where smoke is wrong in depth its pictures change by that, too."""
+    parts, asked = resting(MOVING), []
+    monkeypatch.setattr(forecast, "_confirmed", lambda *parts: asked.append(parts) or 1.0)
+    around = orbit_cameras(Orbit(target=(0.0, 0.0, 0.0), distance=10.0), width=48, height=64, fps=FPS, num_frames=12)
+    list(forecast.run(parts[0], around, parts[1], parts[2], PURE, SilentReport()))
+    assert not asked
+    run(parts, PURE)
+    assert len(asked) == 1
 
 
 def test_moving_smoke_widens_and_a_share_stays() -> None:
