@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from backend.contract.cameras import Cameras
 from backend.contract.job import Config, preset_config
 from backend.fit.state import VisualRecord
 from backend.geometry.camera import View, view_at
@@ -43,7 +44,7 @@ _VIEWS = {"turned_30_db": 30.0, "side_db": 90.0, "back_db": 180.0}  # degrees fr
 def judged(plume: Plume, prior: Prior, config: Config, *, seed: int) -> dict[str, dict[str, float]]:
     """Of each way what `judge_particles` says, and by how much the fit had to be made larger."""
     report = SilentReport()
-    still = _standing(0.0)
+    still = standing(0.0)
     cameras = replace(still, camera_to_world=still.camera_to_world * SEEN)
     layers = filmed_by(plume, cameras, np.random.default_rng(seed))
     found = {}
@@ -62,8 +63,8 @@ def judged(plume: Plume, prior: Prior, config: Config, *, seed: int) -> dict[str
             visual.run(layers, cameras, fluid, config.visual, report, seed=0, done=[], volumes=records, as_wide=bool(as_wide))
         )
         larger = distance_error(plume, particles, view_at(still, 0))
-        placed = [_larger(record, view_at(still, 0), larger) for record in particles]
-        found[name] = {"larger": round(larger, 3), **judge_particles(plume, cameras, placed, views=_views)}
+        placed = [made_larger(record, view_at(still, 0), larger) for record in particles]
+        found[name] = {"larger": round(larger, 3), **judge_particles(plume, cameras, placed, views=views_around)}
     return found
 
 
@@ -80,7 +81,7 @@ def distance_error(plume: Plume, records: list[VisualRecord], view: View) -> flo
     return float(np.mean(real) / np.mean(ours)) if ours else 1.0
 
 
-def _larger(record: VisualRecord, view: View, factor: float) -> VisualRecord:
+def made_larger(record: VisualRecord, view: View, factor: float) -> VisualRecord:
     """The same picture from further away."""
     return replace(
         record,
@@ -91,13 +92,13 @@ def _larger(record: VisualRecord, view: View, factor: float) -> VisualRecord:
     )
 
 
-def _standing(degrees: float) -> Any:
+def standing(degrees: float) -> Cameras:
     width, height = SIZE
     return still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS)
 
 
-def _views(frame: int) -> dict[str, View]:
-    return {name: view_at(_standing(degrees), 0) for name, degrees in _VIEWS.items()}
+def views_around(frame: int) -> dict[str, View]:
+    return {name: view_at(standing(degrees), 0) for name, degrees in _VIEWS.items()}
 
 
 def main(arguments: list[str]) -> int:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 Item = TypeVar("Item", covariant=True)
 
@@ -13,3 +14,19 @@ class Series(Protocol[Item]):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Item: ...
+
+
+@dataclass(frozen=True, slots=True)
+class First(Generic[Item]):
+    """The first `count` of a series, as if there were no more."""
+
+    series: Series[Item]
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> Item:
+        if not 0 <= index < self.count:
+            raise IndexError(index)
+        return self.series[index]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from backend.fit.population import PER_PARTICLE, is_near_image, take
 from backend.fit.refine import as_gaussians
 from backend.fit.replay import births_at_foot, born_again
 from backend.fit.scene import LEAST_TURN, Scene, make_scene, turned_about
-from backend.fit.series import Series
+from backend.fit.series import First, Series
 from backend.fit.state import PhysicalRecord, VisualRecord, VolumeRecord
 from backend.geometry.camera import View
 from backend.published import future as published_future
@@ -33,9 +32,7 @@ from backend.render import splat
 from backend.reporting import Report
 
 _CHECKED = 8  # frames, the last that were seen, by which the motion is checked
-_BELIEVED = (
-    0.8  # of the foretold change: motion that is borne out as far counts whole; 0.87 to 1.03 in the scenes it was tuned on
-)
+_BELIEVED = 0.8  # of the foretold change: motion that is borne out as far counts whole, as the bundled clip's is
 _REPLAYED = 8  # frames whose births the source repeats: a source that is dying must not live up again
 
 
@@ -61,70 +58,62 @@ def run(
             fluid, seen, published or PublishedConfig(), report, num_frames=config.num_frames, view=view, seconds=seconds
         )
         return
-    last = seen[len(seen) - 1]
+    of_all = volumes if volumes is not None and len(volumes) >= len(layers) else None
+    known = Known(scene=scene, layers=layers, fluid=fluid, seen=seen, volumes=of_all)
+    last = known.last
     trust = trust_of(last, config)
     if turned_about(scene.views, scene.anchor) < LEAST_TURN:
-        trust = replace(trust, confirmed=_confirmed(scene, layers, fluid, seen, volumes))
+        trust = replace(trust, confirmed=confirmed(known))
     still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
-    for step, moving in enumerate(_moving(scene, layers, fluid, seen, volumes, config.num_frames)):
+    for step, moving in enumerate(known.going_on(config.num_frames)):
         report.progress(step, config.num_frames)
         yield _expected(moving, still, trust, seconds * (step + 1))
     report.progress(config.num_frames, config.num_frames)
 
 
-@dataclass(frozen=True, slots=True)
-class _First:
-    """The first ones of a series."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """What there is of the frames that were seen; scene: of these and maybe of later ones; volumes: of all of them, or none; the
+    rest as in `run`."""
 
-    series: Series[Any]
-    count: int
+    scene: Scene
+    layers: Series[np.ndarray]
+    fluid: Series[PhysicalRecord]
+    seen: Series[VisualRecord]
+    volumes: Series[VolumeRecord] | None
 
-    def __len__(self) -> int:
-        return self.count
+    @property
+    def last(self) -> VisualRecord:
+        return self.seen[len(self.seen) - 1]
 
-    def __getitem__(self, index: int, /) -> Any:
-        return self.series[index]
+    def first(self, count: int) -> Known:
+        """The same, of the first `count` frames alone."""
+        volumes = First(self.volumes, count) if self.volumes is not None else None
+        layers, fluid, seen = First(self.layers, count), First(self.fluid, min(count, len(self.fluid))), First(self.seen, count)
+        return Known(scene=self.scene, layers=layers, fluid=fluid, seen=seen, volumes=volumes)
 
-
-def _moving(
-    scene: Scene,
-    layers: Series[np.ndarray],
-    fluid: Series[PhysicalRecord],
-    seen: Series[VisualRecord],
-    volumes: Series[VolumeRecord] | None,
-    count: int,
-) -> Iterator[VisualRecord]:
-    """Yields `count` records behind those that are seen, if all smoke goes on as it went."""
-    last, view, seconds = seen[len(seen) - 1], scene.views[len(seen) - 1], scene.seconds_per_frame
-    guides = recent_guides(volumes, layers, scene) if volumes is not None and len(volumes) >= len(layers) else []
-    moving = _going_on(replace(last, next_id=2 * last.next_id), fluid, guides)
-    births = [_going_on(newborn, fluid, guides) for newborn in births_at_foot(seen)[-_REPLAYED:]]
-    for step in range(count):
-        moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
-        moving = born_again(moving, births, step)
-        moving = take(moving, is_near_image(moving.positions, view))
-        yield moving
+    def going_on(self, count: int) -> Iterator[VisualRecord]:
+        """Yields `count` records behind the last one, if all smoke goes on as it went."""
+        view, seconds = self.scene.views[len(self.seen) - 1], self.scene.seconds_per_frame
+        guides = [] if self.volumes is None else recent_guides(self.volumes, self.layers, self.scene)
+        moving = _going_on(replace(self.last, next_id=2 * self.last.next_id), self.fluid, guides)
+        births = [_going_on(newborn, self.fluid, guides) for newborn in births_at_foot(self.seen)[-_REPLAYED:]]
+        for step in range(count):
+            moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
+            moving = born_again(moving, births, step)
+            moving = take(moving, is_near_image(moving.positions, view))
+            yield moving
 
 
-def _confirmed(
-    scene: Scene,
-    layers: Series[np.ndarray],
-    fluid: Series[PhysicalRecord],
-    seen: Series[VisualRecord],
-    volumes: Series[VolumeRecord] | None,
-) -> float:
+def confirmed(known: Known) -> float:
     """How much of the motion the last frames bear out, 0 to 1: what share of the change that it foretells from the frames before,
     against resting smoke, comes nearest to how they are (least squares over their opacities)."""
-    count = min(_CHECKED, (len(seen) - 1) // 2)
-    first = len(seen) - count
-    if count == 0:
-        return 1.0
-    earlier = _First(volumes, first) if volumes is not None and len(volumes) else None
-    foretold = _moving(scene, _First(layers, first), _First(fluid, first), _First(seen, first), earlier, count)
+    count = min(_CHECKED, (len(known.seen) - 1) // 2)
+    before = known.first(len(known.seen) - count)
     borne_out = change = 0.0
-    for frame, moving in enumerate(foretold, start=first):
-        resting, moved = (_opacity(record, scene.views[frame]) for record in (seen[first - 1], moving))
-        borne_out += float(((moved - resting) * (layers[frame][..., 3] - resting)).sum())
+    for frame, moving in enumerate(before.going_on(count), start=len(before.seen)):
+        resting, moved = (_opacity(record, known.scene.views[frame]) for record in (before.last, moving))
+        borne_out += float(((moved - resting) * (known.layers[frame][..., 3] - resting)).sum())
         change += float(np.square(moved - resting).sum())
     return min(max(borne_out / (_BELIEVED * change), 0.0), 1.0) if change > 0.0 else 1.0
 

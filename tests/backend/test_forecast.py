@@ -209,21 +209,25 @@ def test_motion_that_no_picture_bears_out_is_not_foretold() -> None:
     assert decibels(foretold) > 40.0
 
 
+def confirmed(layers: list[np.ndarray], fluid: list[PhysicalRecord], seen: list[VisualRecord]) -> float:
+    scene = make_scene(layers, CAMERAS)
+    return forecast.confirmed(forecast.Known(scene=scene, layers=layers, fluid=fluid, seen=seen, volumes=None))
+
+
 def test_motion_that_pictures_bear_out_is() -> None:
     parts = clip(MOVING, num_frames=12)
-    scene = make_scene(parts[0], CAMERAS)
-    assert forecast._confirmed(scene, *parts, None) == 1.0
+    assert confirmed(*parts) == 1.0
     half = [replace(record, velocities=0.25 * record.velocities) for record in parts[1]], parts[2]
-    assert forecast._confirmed(scene, parts[0], *half, None) == 1.0, "slower than it is, it is not less sure"
+    assert confirmed(parts[0], *half) == 1.0, "slower than it is, it is not less sure"
     fast = [replace(record, velocities=2.0 * record.velocities) for record in parts[1]], parts[2]
-    assert 0.3 < forecast._confirmed(scene, parts[0], *fast, None) < 0.9
-    assert forecast._confirmed(scene, *(part[:2] for part in parts), None) == 1.0, "two frames tell nothing"
+    assert 0.3 < confirmed(parts[0], *fast) < 0.9
+    assert confirmed(*(part[:2] for part in parts)) == 1.0, "two frames tell nothing"
 
 
 def test_before_a_camera_that_moves_it_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where smoke is wrong in depth its pictures change by that, too."""
     parts, asked = resting(MOVING), []
-    monkeypatch.setattr(forecast, "_confirmed", lambda *parts: asked.append(parts) or 1.0)
+    monkeypatch.setattr(forecast, "confirmed", lambda known: asked.append(known) or 1.0)
     around = orbit_cameras(Orbit(target=(0.0, 0.0, 0.0), distance=10.0), width=48, height=64, fps=FPS, num_frames=12)
     list(forecast.run(parts[0], around, parts[1], parts[2], PURE, SilentReport()))
     assert not asked
