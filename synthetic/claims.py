@@ -11,12 +11,13 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from backend.contract.running import is_alive, process_start
 
 STALE_SECONDS = 3 * 3600.0  # longer than any frame takes
+_STALE_TEXT_SECONDS = 60.0  # longer than any small file takes
 
 
 @contextmanager
@@ -30,6 +31,19 @@ def claimed(target: Path, *, stale_seconds: float = STALE_SECONDS) -> Iterator[b
         yield not target.exists()  # the other may have finished between our two looks
     finally:
         claim.unlink(missing_ok=True)
+
+
+def write_once(path: Path, text: str) -> str:
+    """Write a small file if there is none, or wait until another worker has; returns what it holds then."""
+    while not path.exists():
+        with claimed(path, stale_seconds=_STALE_TEXT_SECONDS) as is_ours:
+            if is_ours:
+                part = path.with_name(path.name + ".part")
+                part.write_text(text, encoding="utf-8")
+                part.replace(path)
+        if not is_ours:
+            time.sleep(0.01)
+    return path.read_text(encoding="utf-8")
 
 
 def _take(claim: Path, stale_seconds: float) -> bool:
@@ -51,7 +65,8 @@ def _take(claim: Path, stale_seconds: float) -> bool:
         return False
     is_ours = removed.read_text(encoding="utf-8") == found
     if not is_ours:
-        os.link(removed, claim)
+        with suppress(FileExistsError):  # a third has claimed it since
+            os.link(removed, claim)
     removed.unlink()
     return is_ours and _create(claim, text)
 

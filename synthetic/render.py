@@ -26,7 +26,7 @@ import bpy
 from backend.contract.errors import EXIT_DONE, EXIT_USER, BackendError
 from backend.contract.result import CAMERAS_FILE, vdb_path
 from backend.contract.truth import view_folder
-from synthetic.claims import claimed
+from synthetic.claims import claimed, write_once
 from synthetic.layers import Layer
 from synthetic.plan import (
     SMOKE_FOLDER,
@@ -197,9 +197,9 @@ def _prepare_folders(order: RenderOrder, images: Sequence[Image]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     for view, cameras in view_cameras(order.preset).items():
         if order.views is None or view in order.views:
-            _write_once(order.folder / view_folder(view) / CAMERAS_FILE, cameras.to_json())
+            write_once(order.folder / view_folder(view) / CAMERAS_FILE, cameras.to_json())
     text = json.dumps(describe(order), indent=2, sort_keys=True)
-    if _write_once(order.folder / RENDER_FILE, text) != text:
+    if write_once(order.folder / RENDER_FILE, text) != text:
         raise BackendError(
             "other_render",
             f"{order.folder} holds images of other settings or another Blender.",
@@ -222,16 +222,6 @@ def describe(order: RenderOrder) -> dict[str, object]:
         "own_smoke": order.smoke_folder is not None,
         "own_scene": order.blend_file.name if order.blend_file else None,
     }
-
-
-def _write_once(path: Path, text: str) -> str:
-    """Write a file if there is none; returns what it holds then."""
-    with claimed(path) as is_ours:
-        if is_ours:
-            part = path.with_name(path.name + ".part")
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
-    return path.read_text(encoding="utf-8")
 
 
 def _say_cost(mean: float, num_left: int) -> None:

@@ -8,11 +8,13 @@ import socket
 import subprocess
 import sys
 import textwrap
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from synthetic.claims import claimed
+from synthetic.claims import claimed, write_once
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -83,26 +85,55 @@ def test_an_empty_claim_is_waited_for_and_then_taken(age: float, is_taken: bool,
         assert is_ours is is_taken
 
 
+def output_of_workers(folder: Path, body: str) -> list[str]:
+    """The lines that four processes print which run `body` at once, with `folder` the path of one folder."""
+    program = f"""
+import os, sys
+from pathlib import Path
+sys.path.insert(0, {str(CHECKOUT)!r})
+from synthetic.claims import claimed, write_once
+folder = Path({str(folder)!r})
+{textwrap.dedent(body)}"""
+    children = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    lines = [line for child in children for line in child.communicate()[0].splitlines()]
+    assert all(child.returncode == 0 for child in children)
+    assert not list(folder.glob("*.claim*")) and not list(folder.glob("*.part"))
+    return lines
+
+
 def test_many_workers_make_every_file_exactly_once(tmp_path: Path) -> None:
-    """Four processes over forty files, each first left behind with a dead worker's claim."""
+    """Four processes over forty files, each second one left behind with a dead worker's claim."""
     stale = json.dumps({"host": socket.gethostname(), "pid": dead_process(), "start": None})
     for index in range(0, 40, 2):
         claim_of(tmp_path / f"{index}").write_text(stale)
-    worker = textwrap.dedent(f"""
-        import sys, os
-        from pathlib import Path
-        sys.path.insert(0, {str(CHECKOUT)!r})
-        from synthetic.claims import claimed
+    body = """
         for index in range(40):
-            target = Path({str(tmp_path)!r}) / str(index)
+            target = folder / str(index)
             with claimed(target) as is_ours:
                 if is_ours:
                     with open(target, "x") as file:
                         file.write(str(os.getpid()))
                     print(index)
-    """)
-    children = [subprocess.Popen([sys.executable, "-c", worker], stdout=subprocess.PIPE, text=True) for _ in range(4)]
-    made = [line for child in children for line in child.communicate()[0].split()]
-    assert all(child.returncode == 0 for child in children)
-    assert sorted(made, key=int) == [str(index) for index in range(40)]
-    assert not list(tmp_path.glob("*.claim*"))
+    """
+    assert sorted(output_of_workers(tmp_path, body), key=int) == [str(index) for index in range(40)]
+
+
+def test_workers_that_write_one_text_at_once_all_read_the_same(tmp_path: Path) -> None:
+    body = """
+        for index in range(200):
+            print(index, write_once(folder / str(index), str(os.getpid())))
+    """
+    lines = output_of_workers(tmp_path, body)
+    assert len(lines) == 800
+    assert set(lines) == {f"{index} {(tmp_path / str(index)).read_text()}" for index in range(200)}
+
+
+def test_a_text_that_another_worker_is_at_is_waited_for(tmp_path: Path) -> None:
+    target = tmp_path / "render.json"
+    with claimed(target) as is_ours, ThreadPoolExecutor() as pool:
+        assert is_ours
+        reader = pool.submit(write_once, target, "mine")
+        time.sleep(0.1)
+        assert not reader.done()
+        target.write_text("another's")
+        assert reader.result(timeout=10) == "another's"
