@@ -200,6 +200,22 @@ def test_consistency_holds_those_that_were_there():
     assert visual.consistency(now, variables(0, 1))[0] == 0.0
 
 
+def test_a_frame_begins_with_everyone_as_before(monkeypatch):
+    """Also where the faintest, anywhere among the others, made room for newborn ones."""
+    layers = tiny_clip(2)
+    scene = make_scene(layers, CAMERAS)
+    look = visual._Look(scene, layers, replace(SMALL, num_particles=60), True, 0)
+    record = look.fitted(look.empty(), 0)
+    masses = record.optical_masses * np.where(np.arange(len(record.ids)) % 9 == 4, 0.06, 0.9).astype(np.float32)
+    colors = np.random.default_rng(0).random((len(masses), 3)).astype(np.float32)
+    found, consistency = [], visual.consistency
+    monkeypatch.setattr(visual, "consistency", lambda now, before: found.append((now, before)) or consistency(now, before))
+    look.fitted(replace(record, optical_masses=masses, colors=colors), 1)
+    now, before = found[0]
+    assert 0 < len(before.log_masses) < len(record.ids) < len(now.log_masses)
+    assert consistency(now, before)[0] == 0.0
+
+
 # -- whole fits ----------------------------------------------------------------------------------------------------------
 
 
