@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,23 +52,25 @@ DEMO = CHECKOUT / "synthetic" / "samples" / "demo_plume.mp4"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """One job. clip: as it is called in the results; cameras: a file, or none; is_fitted: the coefficients follow from it."""
+    """One job. clip: as it is called in the results; cameras: a file, or none; settings: as for `--set`; is_fitted: the
+    coefficients follow from it."""
 
     clip: str
     video: str
     preset: str
     frames: tuple[int, int]
     cameras: str | None = None
+    settings: dict[str, str] = field(default_factory=dict)
     is_fitted: bool = True
 
     @property
     def name(self) -> str:
-        way = "given" if self.cameras else "still"
-        return f"{self.clip}_{self.preset}_{self.frames[0]}_{self.frames[1]}_{way}"
+        ways = ("given" if self.cameras else "still", *self.settings.values())
+        return f"{self.clip}_{self.preset}_{self.frames[0]}_{self.frames[1]}_{'_'.join(ways)}"
 
 
 def fitted_trials() -> list[Trial]:
-    """Each preset with the prior and without, on black and matted."""
+    """Each preset with the prior and without, on black and matted; the published methods; and forecasts."""
     found = [
         Trial(clip="demo_plume", video=str(DEMO), preset=preset, frames=(0, count))
         for preset, count in (("draft", 24), ("preview", 16), ("final", 8))
@@ -78,7 +80,17 @@ def fitted_trials() -> list[Trial]:
     # Numbers of frames. Of few frames the prior is asked about none or all, of many now and then.
     for preset, around, still in (("draft", 64, 16), ("preview", 40, 12), ("final", 14, 8)):
         found.append(Trial(clip=scene.name, video=video, preset=preset, frames=(40, 40 + around), cameras=cameras))
-        found.append(Trial(clip=scene.name, video=video, preset=preset, frames=(40, 40 + still)))
+        for settings in ({}, {"volume.use_prior": "false"}):
+            found.append(Trial(clip=scene.name, video=video, preset=preset, frames=(40, 40 + still), settings=settings))
+    for preset, count, settings in (
+        ("draft", 24, {"method": "as_published"}),
+        ("draft", 12, {"method": "fluidnexus"}),
+        ("preview", 12, {"method": "as_published"}),
+        ("draft", 16, {"forecast.num_frames": "32"}),
+        ("preview", 8, {"forecast.num_frames": "16"}),
+    ):
+        frames = (40, 40 + count)
+        found.append(Trial(clip=scene.name, video=video, preset=preset, frames=frames, cameras=cameras, settings=settings))
     return found
 
 
@@ -151,6 +163,7 @@ def run_trial(order: dict[str, Any]) -> None:
         video=trial.video,
         preset=trial.preset,
         cameras=trial.cameras,
+        overrides=trial.settings,
         frame_start=trial.frames[0],
         frame_stop=trial.frames[1],
     )
@@ -162,13 +175,14 @@ def run_trial(order: dict[str, Any]) -> None:
     config, given = job.config(), None if trial.cameras is None else read_cameras(trial.cameras)
     with open_clip(trial.video) as clip:
         first, stop = trial.frames
-        decisions, seen = inspect.run(clip, config, SilentReport(), start=first, stop=stop, given=given)
+        decisions, seen = inspect.run(clip, config, SilentReport(), chosen=trial.settings, start=first, stop=stop, given=given)
     followed = decisions.followed(config)
     speeds = this_machine(kinds_of(followed))
     terms = terms_of(seen, followed, threads=speeds.threads)
     found = {
         "clip": trial.clip,
         "preset": trial.preset,
+        "settings": trial.settings,
         "num_frames": seen.num_frames,
         "size": seen.source_size,
         "has_prior": "volume" in terms,
@@ -225,7 +239,9 @@ def pair_of(record: dict[str, Any], costs: dict[str, Any]) -> dict[str, Any]:
         estimated[stage] = estimated.get(stage, 0.0) + sum(known.get(name, 0.0) * amount for name, amount in terms)
     memory = sum(costs["memory_gib"].get(name, 0.0) * amount for name, amount in record["memory_terms"].items())
     seconds, measured = sum(estimated.values()), sum(record["stages"].values())
-    kept = {name: record[name] for name in ("clip", "preset", "num_frames", "size", "has_prior", "is_fitted", "threads")}
+    kept = {
+        name: record[name] for name in ("clip", "preset", "settings", "num_frames", "size", "has_prior", "is_fitted", "threads")
+    }
     return {
         **kept,
         "estimated_seconds": round(seconds, 2),

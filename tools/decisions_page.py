@@ -179,12 +179,13 @@ def _estimates(results: dict[str, Any]) -> Iterator[str]:
         "passed. Once a job runs, what is over corrects what is left."
     )
     yield ""
-    order = sorted(pairs, key=lambda pair: (pair["is_fitted"], pair["clip"], pair["preset"], pair["has_prior"]))
+    order = sorted(pairs, key=lambda pair: (pair["is_fitted"], pair["clip"], pair["preset"], *sorted(pair["settings"].values())))
     yield from table(
         (
             "clip",
             "preset",
             "frames",
+            "settings",
             "prior",
             "estimated s",
             "took s",
@@ -199,6 +200,7 @@ def _estimates(results: dict[str, Any]) -> Iterator[str]:
                 pair["clip"],
                 pair["preset"],
                 str(pair["num_frames"]),
+                ", ".join(f"{key}={value}" for key, value in pair["settings"].items()) or "-",
                 "yes" if pair["has_prior"] else "no",
                 f"{pair['estimated_seconds']:.1f}",
                 f"{pair['measured_seconds']:.1f}",

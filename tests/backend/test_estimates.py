@@ -61,10 +61,9 @@ def test_every_stage_is_counted_and_every_term_known(preset: str, method: str, a
     assert {term.kind for of in terms.values() for term in of} <= set(kinds_of(config)) <= set(PIECES)
     found = stage_seconds(seen(), config, machine=MACHINE)
     assert all(math.isfinite(seconds) and seconds >= 0.0 for seconds in found.values())
-    if method == "default":
-        assert all(found[stage] > 0.0 for stage in ("inspect", "frames", "smoke", "physical", "visual", "export"))
-        names = {stage: {term.name for term in of} for stage, of in terms.items()}
-        assert all(names[stage] <= set(costs()["stages"][stage]) for stage in names)
+    assert all(found[stage] > 0.0 for stage in ("inspect", "frames", "smoke", "physical", "visual", "export"))
+    names = {stage: {term.name for term in of} for stage, of in terms.items()}
+    assert all(names[stage] <= set(costs()["stages"][stage]) for stage in names)
 
 
 def test_the_prior_is_asked_now_and_then() -> None:
