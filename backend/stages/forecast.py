@@ -33,7 +33,7 @@ from backend.reporting import Report
 
 _CHECKED = 8  # frames, the last that were seen, by which the motion is checked
 _BELIEVED = 0.8  # of the foretold change: motion that is borne out as far counts whole, as the bundled clip's is
-_DEEPER = 1.5  # times as far along the view as is proposed; tuned, as forecast.spreading is, on 40 plumes and three scenes
+DEEPER = 1.5  # times as far along the view as is proposed; tuned, as forecast.spreading is, on 40 plumes and three scenes
 _REPLAYED = 8  # frames whose births the source repeats: a source that is dying must not live up again
 
 
@@ -53,24 +53,22 @@ def run(
     if config.num_frames == 0:
         return
     scene = make_scene(layers, cameras)
-    view, seconds = scene.views[-1], scene.seconds_per_frame
     if method != "default":
+        view, seconds = scene.views[-1], scene.seconds_per_frame
         yield from published_future.run(
             fluid, seen, published or PublishedConfig(), report, num_frames=config.num_frames, view=view, seconds=seconds
         )
         return
     of_all = volumes if volumes is not None and len(volumes) >= len(layers) else None
     known = Known(scene=scene, layers=layers, fluid=fluid, seen=seen, volumes=of_all)
-    last = known.last
-    trust, deeper = trust_of(last, config), 1.0
+    trust, deeper = trust_of(known.last, config), 1.0
     if turned_about(scene.views, scene.anchor) < LEAST_TURN:
         trust = replace(trust, confirmed=confirmed(known))
     elif of_all is not None:
-        deeper = _DEEPER
-    still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
-    for step, moving in enumerate(known.going_on(config.num_frames, deeper=deeper)):
+        deeper = DEEPER
+    for step, record in enumerate(foretold(known, trust, config.num_frames, deeper=deeper)):
         report.progress(step, config.num_frames)
-        yield _expected(moving, still, trust, seconds * (step + 1))
+        yield record
     report.progress(config.num_frames, config.num_frames)
 
 
@@ -113,6 +111,15 @@ class Known:
             moving = born_again(moving, births, step)
             moving = take(moving, is_near_image(moving.positions, view))
             yield moving
+
+
+def foretold(known: Known, trust: Trust, count: int, *, deeper: float = 1.0) -> Iterator[VisualRecord]:
+    """Yields `count` records behind the last one: the mean over what may become of the smoke, as far as its motion is to be
+    trusted. deeper: see `Known.going_on`."""
+    last = known.last
+    still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
+    for step, moving in enumerate(known.going_on(count, deeper=deeper), start=1):
+        yield _expected(moving, still, trust, known.scene.seconds_per_frame * step)
 
 
 def confirmed(known: Known) -> float:

@@ -244,7 +244,7 @@ def test_motion_that_volumes_tell_goes_further_along_a_view_that_goes_around(mon
 
     def ways(times: float, cameras: Cameras, told: list[VolumeRecord] | None) -> np.ndarray:
         """[N, 3] m that parcels go sideways, down and along the last view."""
-        monkeypatch.setattr(forecast, "_DEEPER", times)
+        monkeypatch.setattr(forecast, "DEEPER", times)
         last = list(forecast.run(layers, cameras, fluid, seen, PURE, SilentReport(), volumes=told))[-1]
         return (last.positions[:120] - seen[-1].positions) @ axes
 
