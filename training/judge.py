@@ -6,7 +6,6 @@ A scene of the benchmark is one plume, and what is chosen by three of them may b
 back, in any wind. Each is filmed as the benchmark's are, and its volumes are made as a fit makes them
 (`backend/stages/volume.py`), on the grids that the pictures alone ask for and on those that the prior then moves to where it sees
 the smoke. The particles that a fit makes of the latter are judged, too: what is better of volumes is not always better of them.
-Every plume is written as soon as it is judged; those that the file holds are not judged again.
 """
 
 from __future__ import annotations
@@ -14,42 +13,36 @@ from __future__ import annotations
 from backend import kernel_setup  # noqa: F401 before numba loads
 
 # isort: split
-import argparse
-import json
 import math
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from backend.contract.cameras import Cameras
-from backend.contract.job import preset_config
+from backend.contract.job import Config
 from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
 from backend.fit.state import VisualRecord, VolumeRecord, particle_frame
 from backend.geometry.camera import View, view_at
-from backend.io.atomic import write_text
 from backend.prior.predict import Prior
-from backend.prior.weights import WEIGHTS, weights_fingerprint
 from backend.render.motion import smoke_and_motion
 from backend.render.picture import picture
 from backend.reporting import SilentReport
 from backend.score.measures import coded, correlation, decibels, velocity_scores
 from backend.score.volumes import camera_axes
 from backend.stages import visual, volume
-from synthetic.progress import Progress
 from synthetic.sweep import Orbit, orbit_cameras, still_cameras
-from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume, read_plume
+from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 from training.samples import lattice_of, truth
 from training.train import held_back
+from training.verdicts import judge_all
 
 SIZE = 90, 160  # px
 LIGHT = 0.4  # of opaque smoke, linear
 SEEN = 120  # frames of a clip
-_PRESET = "draft"  # of the particles: the volumes that lead them are every preset's
 _VIEWS = {"nvs_last_db": 0.0, "side_db": 90.0}  # degrees from the first place of the camera
 _FAINT = 20.0  # 1/m, summed over the voxels: a moment with less shows no smoke
 _LEVEL = 0.02  # of the fullest level: those with less are not asked where they are
@@ -57,9 +50,14 @@ _LEVEL = 0.02  # of the fullest level: those with less are not asked where they 
 
 def film(plume: Plume, draw: np.random.Generator) -> tuple[list[np.ndarray], Cameras]:
     """Smoke layers [H, W, 4] of the frames that are seen, in eight bits with noise, and the cameras."""
-    width, height = SIZE
-    cameras = orbit_cameras(Orbit(), width=width, height=height, fps=FPS, num_frames=NUM_FRAMES)
+    cameras = going_around()
     return filmed_by(plume, cameras, draw), replace(cameras, camera_to_world=cameras.camera_to_world[:SEEN])
+
+
+def going_around() -> Cameras:
+    """Of all frames of a plume, those behind the clip among them."""
+    width, height = SIZE
+    return orbit_cameras(Orbit(), width=width, height=height, fps=FPS, num_frames=NUM_FRAMES)
 
 
 def filmed_by(plume: Plume, cameras: Cameras, draw: np.random.Generator) -> list[np.ndarray]:
@@ -95,7 +93,7 @@ def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:
         row["level_m"] = stand.lattice.voxel_size * levels_off(guide.density, density)
         for name, view in _views(frame).items():
             shown = -np.expm1(-optical_depth(guide.density, stand.lattice, stand.seen(view)))
-            row[name] = _likeness(layer_of(shown), plume, frame, view)
+            row[name] = likeness(layer_of(shown), plume, frame, view)
         rows.append(row)
     return _means(rows)
 
@@ -111,7 +109,7 @@ def judge_particles(
         real = plume.density_at(frame), plume.velocity_at(frame)
         row = _row(smoke_and_motion(ours, lattice_of(plume)), real, axes=camera_axes(view_at(cameras, frame)))
         for name, view in (views or _views)(frame).items():
-            row[name] = _likeness(picture(ours, view), plume, frame, view)
+            row[name] = likeness(picture(ours, view), plume, frame, view)
         rows.append(row)
     return _means(rows)
 
@@ -137,15 +135,16 @@ def moments(plume: Plume) -> list[int]:
 
 def _views(frame: int) -> dict[str, View]:
     """From where a frame is looked at; from the first place late in the clip alone, when the camera has gone far."""
+    return {name: view_at(standing(degrees), 0) for name, degrees in _VIEWS.items() if degrees or frame >= 2 * SEEN // 3}
+
+
+def standing(degrees: float) -> Cameras:
+    """So far around from the first place of the camera that goes around."""
     width, height = SIZE
-    return {
-        name: view_at(still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS), 0)
-        for name, degrees in _VIEWS.items()
-        if degrees or frame >= 2 * SEEN // 3
-    }
+    return still_cameras(Orbit(), turned=degrees, width=width, height=height, fps=FPS)
 
 
-def _likeness(shown: np.ndarray, plume: Plume, frame: int, view: View) -> float:
+def likeness(shown: np.ndarray, plume: Plume, frame: int, view: View) -> float:
     """PSNR of a picture [H, W, 4], dB."""
     wrong = coded(shown) - coded(layer_of(opacity_of(plume, frame, view)))
     return decibels(float(np.square(wrong).mean(dtype=np.float64)))
@@ -165,45 +164,26 @@ def levels_off(ours: np.ndarray, real: np.ndarray) -> float:
     return math.sqrt(np.average(np.square(middles[0] - middles[1]), weights=masses[1][counted]))
 
 
-def judged(plume: Plume, prior: Prior, *, seed: int) -> dict[str, dict[str, float]]:
-    """Of volumes on grids as the pictures alone ask for them and as the prior moves them, and of particles made of the latter."""
+def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, Any]:
+    """Of the plume its wind, m/s; of volumes on grids as the pictures alone ask for them and as the prior moves them, and of
+    particles made of the latter, what `judge` and `judge_particles` say."""
     report = SilentReport()
-    layers, cameras = film(plume, np.random.default_rng(seed))
+    layers, cameras = film(plume, np.random.default_rng(plume.scene.seed))
     plan = volume.make_plan(layers, cameras, every=5)
+    found: dict[str, Any] = {"wind": round(float(np.hypot(*plume.scene.wind)), 3)}
     if plan is None:
-        return {}
-    found, records = {}, []
+        return found
+    records = []
     for name, way in (("by the pictures", plan), ("by the prior", volume.centred(plan, report, prior=prior))):
         proposals = list(volume.propose(way, report, prior=prior, done=[]))
         records = list(volume.run(way, report, proposals, levels=prior.levels, shares=prior.shares))
         found[name] = judge(plume, records)
-    config = preset_config(_PRESET).visual
-    particles = list(visual.run(layers, cameras, [], config, report, seed=0, done=[], volumes=records))
+    particles = list(visual.run(layers, cameras, [], config.visual, report, seed=0, done=[], volumes=records))
     return found | {"particles": judge_particles(plume, cameras, particles)}
 
 
 def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--plumes", type=Path, required=True)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--weights", type=Path, default=WEIGHTS)
-    given = parser.parse_args(arguments)
-    folders = held_back(sorted(path.parent for path in given.plumes.glob("*/plume.json")))
-    mark = weights_fingerprint(given.weights)[:12]
-    results: dict[str, Any] = {"weights": mark, "plumes": {}}
-    if given.json.exists():
-        results = json.loads(given.json.read_text(encoding="utf-8"))
-        if results["weights"] != mark:
-            parser.error(f"{given.json} is of other weights; name another file.")
-    prior, progress = Prior(given.weights), Progress(label="judge volumes", total=len(folders))
-    for folder in folders:
-        plume = read_plume(folder)
-        if plume.scene.name not in results["plumes"]:
-            wind = round(float(np.hypot(*plume.scene.wind)), 3)
-            results["plumes"][plume.scene.name] = {"wind": wind, **judged(plume, prior, seed=plume.scene.seed)}
-            write_text(given.json, json.dumps(results, indent=1) + "\n")
-        progress.step()
-    return 0
+    return judge_all(arguments, judged, description=__doc__, label="judge volumes", chosen=held_back)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,85 @@
+"""How right forecasts are of plumes that go on behind the clip.
+
+    .venv/backend/bin/python -m training.judge_forecast --plumes DIR --json FILE [--preset draft] [--weights FILE]
+
+Each plume is filmed as the benchmark's scenes are, by a camera that goes around it, and its first 120 frames are fitted; the
+other 15 are foretold: at rest, which is a trivial answer; with the motion that volumes say; widening more; and going further
+along the view as well, as jobs do. The plumes must be none that the prior was taught on.
+"""
+
+from __future__ import annotations
+
+from backend import kernel_setup  # noqa: F401 before numba loads
+
+# isort: split
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from backend.contract.job import Config, ForecastConfig
+from backend.fit.future import trust_of
+from backend.fit.scene import make_scene
+from backend.fit.state import VisualRecord, particle_frame
+from backend.geometry.camera import view_at
+from backend.prior.predict import Prior
+from backend.render.picture import picture
+from backend.reporting import SilentReport
+from backend.stages import forecast, physical, visual, volume
+from training.judge import SEEN, film, going_around, likeness, standing
+from training.library import NUM_FRAMES, Plume
+from training.verdicts import judge_all
+
+_SPREADING = ForecastConfig().spreading
+WAYS = {  # spreading, and how many times as far along the view as volumes say
+    "at rest": None,
+    "as volumes say": (0.1, 1.0),
+    "widening more": (_SPREADING, 1.0),
+    "and further along the view": (_SPREADING, forecast.DEEPER),
+}
+_STEP = 2  # frames: every second one is looked at
+
+
+def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, Any]:
+    """Of the plume its wind, m/s; of each way the mean PSNR of the foretold frames, dB, in the input's view, from its first place
+    and from aside."""
+    report, ahead = SilentReport(), NUM_FRAMES - SEEN
+    layers, cameras = film(plume, np.random.default_rng(plume.scene.seed))
+    plan = volume.make_plan(layers, cameras, every=config.volume.every, finer=config.volume.finer)
+    if plan is None:
+        return {}
+    plan = volume.centred(plan, report, prior=prior)
+    proposals = list(volume.propose(plan, report, prior=prior, done=[]))
+    volumes = list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
+    fluid = list(physical.run(layers, cameras, config.physical, report, seed=0, done=[], volumes=volumes))
+    seen = list(visual.run(layers, cameras, fluid, config.visual, report, seed=0, done=[], volumes=volumes))
+    known = forecast.Known(scene=make_scene(layers, cameras), layers=layers, fluid=fluid, seen=seen, volumes=volumes)
+    found: dict[str, Any] = {"wind": round(float(np.hypot(*plume.scene.wind)), 3)}
+    for name, way in WAYS.items():
+        foretold = [known.last] * ahead
+        if way is not None:
+            spreading, deeper = way
+            trust = trust_of(known.last, replace(config.forecast, spreading=spreading))
+            foretold = list(forecast.foretold(known, trust, ahead, deeper=deeper))
+        found[name] = likeness_of(plume, foretold)
+    return found
+
+
+def likeness_of(plume: Plume, foretold: list[VisualRecord]) -> dict[str, float]:
+    """Of the records of all frames behind the clip, as `judged` says."""
+    filmed, found = going_around(), {"input_db": [], "nvs_db": [], "side_db": []}
+    for frame in range(SEEN, NUM_FRAMES, _STEP):
+        ours = particle_frame(foretold[frame - SEEN])
+        views = view_at(filmed, frame), view_at(standing(0.0), 0), view_at(standing(90.0), 0)
+        for values, view in zip(found.values(), views, strict=True):
+            values.append(likeness(picture(ours, view), plume, frame, view))
+    return {name: round(float(np.mean(values)), 3) for name, values in found.items()}
+
+
+def main(arguments: list[str]) -> int:
+    return judge_all(arguments, judged, description=__doc__, label="judge forecasts")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
