@@ -224,7 +224,7 @@ class WILDSMOKE_PG_forecast(bpy.types.PropertyGroup):
     spreading: FloatProperty(
         name="Spreading",
         description="By how much moving smoke widens: standard deviation as a share of its way",
-        default=0.15,
+        default=0.1,
         min=0.0,
         max=10.0,
     )

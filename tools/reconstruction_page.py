@@ -238,7 +238,14 @@ def how(figures: dict[str, Any]) -> str:
     threads = " or ".join(sorted({str(cell["cost"]["threads"]) for cell in cells}))
     loads = [cell["cost"]["load"] for cell in cells]
     weights = sorted({cell["weights"][:12] for cell in cells if cell["weights"]})
-    codes = sorted({cell["code"] for cell in cells})
+    codes: dict[str, set[str]] = {}
+    for cell in cells:
+        codes.setdefault(cell["code"], set()).add(cell["method"])
+    if len(codes) > 1:
+        made = " and ".join(f"{code} ({', '.join(sorted(methods))})" for code, methods in sorted(codes.items()))
+        made += ", measured in different runs: seconds of one are not to be held against those of another"
+    else:
+        made = "".join(codes)
     versions = ", ".join(f"{name} {number}" for name, number in figures["versions"].items())
     return (
         "`python -m benchmarks.reconstruction --out DIR --page`. Fitted from smoke on black with the true cameras; "
@@ -247,7 +254,7 @@ def how(figures: dict[str, Any]) -> str:
         f"Machine: {machine['processor']}, {machine['cores']} cores, {machine['memory_gib']:.0f} GiB, {machine['system']}; "
         f"{threads} threads, load average {min(loads):.1f} to {max(loads):.1f} at the starts. {versions}. "
         f"{'Weights of the prior' if weights else 'No weights of a prior'} {' and '.join(weights)}".rstrip()
-        + f"; sources {' and '.join(codes)}. Settings of each preset and method: `settings` in the file.\n"
+        + f"; sources {made}. Settings of each preset and method: `settings` in the file.\n"
     )
 
 

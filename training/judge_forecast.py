@@ -3,8 +3,8 @@
     .venv/backend/bin/python -m training.judge_forecast --plumes DIR --json FILE [--preset draft] [--weights FILE]
 
 Each plume is filmed as the benchmark's scenes are, by a camera that goes around it, and its first 120 frames are fitted; the
-other 15 are foretold: at rest, which is a trivial answer; with the motion that volumes say; widening more; and going further
-along the view as well, as jobs do. The plumes must be none that the prior was taught on.
+other 15 are foretold. The trivial answer beside it is the last fitted frame at rest. The plumes must be none that the prior was
+taught on.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ from backend import kernel_setup  # noqa: F401 before numba loads
 
 # isort: split
 import sys
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from backend.contract.job import Config, ForecastConfig
+from backend.contract.job import Config
 from backend.fit.future import trust_of
 from backend.fit.scene import make_scene
 from backend.fit.state import VisualRecord, particle_frame
@@ -31,19 +30,13 @@ from training.judge import SEEN, film, going_around, likeness, standing
 from training.library import NUM_FRAMES, Plume
 from training.verdicts import judge_all
 
-_SPREADING = ForecastConfig().spreading
-WAYS = {  # spreading, and how many times as far along the view as volumes say
-    "at rest": None,
-    "as volumes say": (0.1, 1.0),
-    "widening more": (_SPREADING, 1.0),
-    "and further along the view": (_SPREADING, forecast.DEEPER),
-}
+WAYS = ("at rest", "foretold")
 _STEP = 2  # frames: every second one is looked at
 
 
 def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, Any]:
-    """Of the plume its wind, m/s; of each way the mean PSNR of the foretold frames, dB, in the input's view, from its first place
-    and from aside."""
+    """Of the plume its wind, m/s; of either way the mean PSNR of the foretold frames, dB, in the input's view, from its first
+    place and from aside."""
     report, ahead = SilentReport(), NUM_FRAMES - SEEN
     layers, cameras = film(plume, np.random.default_rng(plume.scene.seed))
     plan = volume.make_plan(layers, cameras, every=config.volume.every, finer=config.volume.finer)
@@ -56,13 +49,9 @@ def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, Any]:
     seen = list(visual.run(layers, cameras, fluid, config.visual, report, seed=0, done=[], volumes=volumes))
     known = forecast.Known(scene=make_scene(layers, cameras), layers=layers, fluid=fluid, seen=seen, volumes=volumes)
     found: dict[str, Any] = {"wind": round(float(np.hypot(*plume.scene.wind)), 3)}
-    for name, way in WAYS.items():
-        foretold = [known.last] * ahead
-        if way is not None:
-            spreading, deeper = way
-            trust = trust_of(known.last, replace(config.forecast, spreading=spreading))
-            foretold = list(forecast.foretold(known, trust, ahead, deeper=deeper))
-        found[name] = likeness_of(plume, foretold)
+    foretold = list(forecast.foretold(known, trust_of(known.last, config.forecast), ahead))
+    for name, records in zip(WAYS, ([known.last] * ahead, foretold), strict=True):
+        found[name] = likeness_of(plume, records)
     return found
 
 

@@ -215,7 +215,7 @@ class ForecastConfig:
 
     num_frames: int = 0
     fading: float = 0.3
-    spreading: float = 0.15
+    spreading: float = 0.1
 
     def __post_init__(self) -> None:
         _check("num_frames", self.num_frames, 0, 10_000)

@@ -1,8 +1,7 @@
 """The most likely next frames: the last frame's smoke goes on as it went, and the source on emitting.
 
 What is known of the future fades with the horizon. So a share of the smoke stays where it was seen last, a share that
-grows; and what moves widens with the way that it has gone. Near frames move, far ones come to rest in a blur between. Of motion
-along the view volumes say too little: a camera that goes around the smoke sees least of it.
+grows; and what moves widens with the way that it has gone. Near frames move, far ones come to rest in a blur between.
 
 Smoke that looks the same while it flows, or a prior that sees motion where there is none, would be moved wrongly: before a camera
 that stands still the last frames that were seen are foretold from those before, and where they have changed by less than that,
@@ -20,6 +19,7 @@ import numpy as np
 from backend.contract.cameras import Cameras
 from backend.contract.job import ForecastConfig, PublishedConfig
 from backend.fit.future import Trust, recent_guides, recent_velocity, trust_of
+from backend.fit.guide import Guide
 from backend.fit.population import PER_PARTICLE, is_near_image, take
 from backend.fit.refine import as_gaussians
 from backend.fit.replay import births_at_foot, born_again
@@ -33,7 +33,6 @@ from backend.reporting import Report
 
 _CHECKED = 8  # frames, the last that were seen, by which the motion is checked
 _BELIEVED = 0.8  # of the foretold change: motion that is borne out as far counts whole, as the bundled clip's is
-DEEPER = 1.5  # times as far along the view as is proposed; tuned, as forecast.spreading is, on 40 plumes and three scenes
 _REPLAYED = 8  # frames whose births the source repeats: a source that is dying must not live up again
 
 
@@ -61,12 +60,10 @@ def run(
         return
     of_all = volumes if volumes is not None and len(volumes) >= len(layers) else None
     known = Known(scene=scene, layers=layers, fluid=fluid, seen=seen, volumes=of_all)
-    trust, deeper = trust_of(known.last, config), 1.0
+    trust = trust_of(known.last, config)
     if turned_about(scene.views, scene.anchor) < LEAST_TURN:
         trust = replace(trust, confirmed=confirmed(known))
-    elif of_all is not None:
-        deeper = DEEPER
-    for step, record in enumerate(foretold(known, trust, config.num_frames, deeper=deeper)):
+    for step, record in enumerate(foretold(known, trust, config.num_frames)):
         report.progress(step, config.num_frames)
         yield record
     report.progress(config.num_frames, config.num_frames)
@@ -93,19 +90,12 @@ class Known:
         layers, fluid, seen = First(self.layers, count), First(self.fluid, min(count, len(self.fluid))), First(self.seen, count)
         return Known(scene=self.scene, layers=layers, fluid=fluid, seen=seen, volumes=volumes)
 
-    def going_on(self, count: int, *, deeper: float = 1.0) -> Iterator[VisualRecord]:
-        """Yields `count` records behind the last one, if all smoke goes on as it went, along the view that many times as far."""
+    def going_on(self, count: int) -> Iterator[VisualRecord]:
+        """Yields `count` records behind the last one, if all smoke goes on as it went."""
         view, seconds = self.scene.views[len(self.seen) - 1], self.scene.seconds_per_frame
         guides = [] if self.volumes is None else recent_guides(self.volumes, self.layers, self.scene)
-        ahead = view.camera_to_world[:3, 2]
-        stretch = np.eye(3) + (deeper - 1.0) * np.outer(ahead, ahead)
-
-        def as_it_went(record: VisualRecord) -> VisualRecord:
-            velocities = recent_velocity(record.positions, self.fluid, guides) @ stretch
-            return replace(record, velocities=velocities.astype(np.float32))
-
-        moving = as_it_went(replace(self.last, next_id=2 * self.last.next_id))
-        births = [as_it_went(newborn) for newborn in births_at_foot(self.seen)[-_REPLAYED:]]
+        moving = _going_on(replace(self.last, next_id=2 * self.last.next_id), self.fluid, guides)
+        births = [_going_on(newborn, self.fluid, guides) for newborn in births_at_foot(self.seen)[-_REPLAYED:]]
         for step in range(count):
             moving = replace(moving, positions=moving.positions + seconds * moving.velocities)
             moving = born_again(moving, births, step)
@@ -113,12 +103,12 @@ class Known:
             yield moving
 
 
-def foretold(known: Known, trust: Trust, count: int, *, deeper: float = 1.0) -> Iterator[VisualRecord]:
+def foretold(known: Known, trust: Trust, count: int) -> Iterator[VisualRecord]:
     """Yields `count` records behind the last one: the mean over what may become of the smoke, as far as its motion is to be
-    trusted. deeper: see `Known.going_on`."""
+    trusted."""
     last = known.last
     still = replace(last, velocities=np.zeros_like(last.velocities), ids=last.ids + last.next_id)
-    for step, moving in enumerate(known.going_on(count, deeper=deeper), start=1):
+    for step, moving in enumerate(known.going_on(count), start=1):
         yield _expected(moving, still, trust, known.scene.seconds_per_frame * step)
 
 
@@ -144,6 +134,10 @@ def deviations(last: VisualRecord, config: ForecastConfig, *, seconds: float) ->
     """How far parcels are from where they will be, root mean square, m, in each of config.num_frames frames of `seconds`."""
     trust = trust_of(last, config)
     return [trust.deviation(seconds * (step + 1)) for step in range(config.num_frames)]
+
+
+def _going_on(record: VisualRecord, fluid: Series[PhysicalRecord], guides: list[Guide]) -> VisualRecord:
+    return replace(record, velocities=recent_velocity(record.positions, fluid, guides).astype(np.float32))
 
 
 def _expected(moving: VisualRecord, still: VisualRecord, trust: Trust, seconds: float) -> VisualRecord:

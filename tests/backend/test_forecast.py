@@ -235,26 +235,6 @@ def test_before_a_camera_that_moves_it_is_not_asked(monkeypatch: pytest.MonkeyPa
     assert len(asked) == 1
 
 
-def test_motion_that_volumes_tell_goes_further_along_a_view_that_goes_around(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing changes across it, nor where the camera stands still or no volume tells."""
-    layers, fluid, seen = clip(MOVING)
-    volumes = [volume(MOVING)] * len(layers)
-    around = orbit_cameras(Orbit(target=(0.0, 0.0, 0.0), distance=10.0), width=48, height=64, fps=FPS, num_frames=12)
-    axes = make_scene(layers, around).views[-1].camera_to_world[:3, :3]
-
-    def ways(times: float, cameras: Cameras, told: list[VolumeRecord] | None) -> np.ndarray:
-        """[N, 3] m that parcels go sideways, down and along the last view."""
-        monkeypatch.setattr(forecast, "DEEPER", times)
-        last = list(forecast.run(layers, cameras, fluid, seen, PURE, SilentReport(), volumes=told))[-1]
-        return (last.positions[:120] - seen[-1].positions) @ axes
-
-    plain, further = ways(1.0, around, volumes), ways(1.5, around, volumes)
-    np.testing.assert_allclose(further, plain * (1.0, 1.0, 1.5), atol=1e-6)
-    assert np.abs(plain[:, 2]).min() > 0.02
-    for cameras, told in ((around, None), (CAMERAS, volumes)):
-        np.testing.assert_array_equal(ways(1.5, cameras, told), ways(1.0, cameras, told))
-
-
 def test_moving_smoke_widens_and_a_share_stays() -> None:
     parts, config = clip(MOVING), ForecastConfig(num_frames=4, fading=0.4, spreading=0.25)
     trust = trust_of(parts[2][-1], config)

@@ -185,7 +185,7 @@ def test_any_forecast(table):
     shown = frame_mass(scene, layers[-1], 2)
     worst, tried = 0.0, 0
     for count in (0, 1, 60):
-        for fading, spreading in ((0.0, 0.0), (0.3, 0.15), (100.0, 10.0)):
+        for fading, spreading in ((0.0, 0.0), (0.3, 0.1), (100.0, 10.0)):
             for fps in (1.0, 1000.0):
                 fluid, seen = records(count)
                 config = ForecastConfig(
