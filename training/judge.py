@@ -1,11 +1,12 @@
 """How right the volumes of a fit, and its particles, are for plumes that the prior was held back from.
 
-    .venv/backend/bin/python -m training.judge --plumes DIR --json FILE [--weights FILE]
+    .venv/backend/bin/python -m training.judge --plumes DIR --json FILE [--preset draft] [--weights FILE]
 
 A scene of the benchmark is one plume, and what is chosen by three of them may be chosen by chance; here are as many as were held
 back, in any wind. Each is filmed as the benchmark's are, and its volumes are made as a fit makes them
 (`backend/stages/volume.py`), on the grids that the pictures alone ask for and on those that the prior then moves to where it sees
 the smoke. The particles that a fit makes of the latter are judged, too: what is better of volumes is not always better of them.
+The preset is that of the particles.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from backend.contract.cameras import Cameras
-from backend.contract.job import Config
+from backend.contract.job import Config, VolumeConfig
 from backend.field.rays import optical_depth
 from backend.fit.guide import Guide
 from backend.fit.state import VisualRecord, VolumeRecord, particle_frame
@@ -30,15 +31,15 @@ from backend.geometry.camera import View, view_at
 from backend.prior.predict import Prior
 from backend.render.motion import smoke_and_motion
 from backend.render.picture import picture
-from backend.reporting import SilentReport
+from backend.reporting import Report, SilentReport
 from backend.score.measures import coded, correlation, decibels, velocity_scores
 from backend.score.volumes import camera_axes
 from backend.stages import visual, volume
 from synthetic.sweep import Orbit, orbit_cameras, still_cameras
+from training.judge_command import judge_all
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 from training.samples import lattice_of, truth
 from training.train import held_back
-from training.verdicts import judge_all
 
 SIZE = 90, 160  # px
 LIGHT = 0.4  # of opaque smoke, linear
@@ -78,6 +79,20 @@ def layer_of(opacity: np.ndarray) -> np.ndarray:
 def opacity_of(plume: Plume, frame: int, view: View) -> np.ndarray:
     """[H, W] of the true smoke."""
     return -np.expm1(-optical_depth(plume.density_at(frame), lattice_of(plume), view, step=0.5))
+
+
+def volumes_of(
+    layers: list[np.ndarray], cameras: Cameras, prior: Prior, settings: VolumeConfig, report: Report
+) -> list[VolumeRecord] | None:
+    """As a job makes them; None of a clip without smoke."""
+    plan = volume.make_plan(
+        layers, cameras, stride=settings.stride, every=settings.every, finer=settings.finer, as_wide=settings.as_deep_as_wide
+    )
+    if plan is None:
+        return None
+    plan = volume.centred(plan, report, prior=prior)
+    proposals = list(volume.propose(plan, report, prior=prior, done=[]))
+    return list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
 
 
 def judge(plume: Plume, records: list[VolumeRecord]) -> dict[str, float]:

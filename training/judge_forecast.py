@@ -25,10 +25,10 @@ from backend.geometry.camera import view_at
 from backend.prior.predict import Prior
 from backend.render.picture import picture
 from backend.reporting import SilentReport
-from backend.stages import forecast, physical, visual, volume
-from training.judge import SEEN, film, going_around, likeness, standing
+from backend.stages import forecast, physical, visual
+from training.judge import SEEN, film, going_around, likeness, standing, volumes_of
+from training.judge_command import judge_all
 from training.library import NUM_FRAMES, Plume
-from training.verdicts import judge_all
 
 WAYS = ("at rest", "foretold")
 _STEP = 2  # frames: every second one is looked at
@@ -39,12 +39,9 @@ def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, Any]:
     place and from aside."""
     report, ahead = SilentReport(), NUM_FRAMES - SEEN
     layers, cameras = film(plume, np.random.default_rng(plume.scene.seed))
-    plan = volume.make_plan(layers, cameras, every=config.volume.every, finer=config.volume.finer)
-    if plan is None:
+    volumes = volumes_of(layers, cameras, prior, config.volume, report)
+    if volumes is None:
         return {}
-    plan = volume.centred(plan, report, prior=prior)
-    proposals = list(volume.propose(plan, report, prior=prior, done=[]))
-    volumes = list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
     fluid = list(physical.run(layers, cameras, config.physical, report, seed=0, done=[], volumes=volumes))
     seen = list(visual.run(layers, cameras, fluid, config.visual, report, seed=0, done=[], volumes=volumes))
     known = forecast.Known(scene=make_scene(layers, cameras), layers=layers, fluid=fluid, seen=seen, volumes=volumes)

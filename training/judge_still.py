@@ -23,11 +23,11 @@ from backend.fit.state import VisualRecord
 from backend.geometry.camera import View, view_at
 from backend.prior.predict import Prior
 from backend.reporting import SilentReport
-from backend.stages import physical, visual, volume
-from training.judge import SEEN, filmed_by, judge_particles, moments, standing
+from backend.stages import physical, visual
+from training.judge import SEEN, filmed_by, judge_particles, moments, standing, volumes_of
+from training.judge_command import judge_all
 from training.library import Plume
 from training.samples import lattice_of
-from training.verdicts import judge_all
 
 WAYS = {"by the images": None, "by the prior": False, "as deep as wide": True}
 _VIEWS = {"turned_30_db": 30.0, "side_db": 90.0, "back_db": 180.0}  # degrees from the camera
@@ -45,12 +45,10 @@ def judged(plume: Plume, prior: Prior, config: Config) -> dict[str, dict[str, fl
         if as_wide is None:
             fluid = list(physical.run(layers, cameras, config.physical, report, seed=0, done=[]))
         else:
-            plan = volume.make_plan(layers, cameras, every=config.volume.every, finer=config.volume.finer, as_wide=as_wide)
-            if plan is None:
+            settings = replace(config.volume, as_deep_as_wide=as_wide)
+            records = volumes_of(layers, cameras, prior, settings, report)
+            if records is None:
                 return {}
-            plan = volume.centred(plan, report, prior=prior)
-            proposals = list(volume.propose(plan, report, prior=prior, done=[]))
-            records = list(volume.run(plan, report, proposals, levels=prior.levels, shares=prior.shares))
         particles = list(
             visual.run(layers, cameras, fluid, config.visual, report, seed=0, done=[], volumes=records, as_wide=bool(as_wide))
         )

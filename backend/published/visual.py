@@ -142,7 +142,6 @@ class _Look:
 
     def fitted(self, record: VisualRecord, frame: int) -> VisualRecord:
         """The carried record with newborn particles, brought to the frame's picture; without the spent and departed."""
-        carried = record
         depth, view = optical_depth(self.layers[frame]), self.scene.views[frame]
         prior = depth_prior.inflate(depth, view, self.scene.anchor)
         record = replace(record, positions=depth_prior.contain(record.positions, prior, view, share=CONTAINMENT))
@@ -152,7 +151,7 @@ class _Look:
         iterations = self.config.visual_iterations * (self.config.first_frame_factor if frame == 0 else 1)
         done = self.config.visual_iterations * (frame + self.config.first_frame_factor - 1) if frame else 0
         now = _Variables.of(record)
-        before = _Variables.of(take(carried, np.isin(carried.ids, record.ids)))  # the faintest made room for newborn ones
+        before = _Variables.of(take(record, record.born < frame))  # without those that made room for newborn ones
         adam = (
             Adam.like(now.log_masses, MASS_STEP, floor=1.0), Adam.like(now.log_scales, SCALE_STEP, floor=1.0),
             Adam.like(now.rotations, ROTATION_STEP, floor=1.0), Adam.like(now.colors, COLOR_STEP, floor=1.0),

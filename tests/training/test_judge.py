@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from true_gaussians import true_gaussians
+from made_plumes import grid, made_plume, true_gaussians
 
 from backend.fit.state import VolumeRecord
 from backend.geometry.camera import view_at
 from backend.prior.window import SHAPE, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.judge import film, judge, judge_particles, levels_off
-from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, VOXEL_SIZE, Plume
-from training.plumes import SIZE, plume
+from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 from training.samples import truth
 from training.train import held_back
 
@@ -25,16 +24,9 @@ CELL = 0.5  # m
 @pytest.fixture(scope="module")
 def column() -> Plume:
     """Smoke that leans to one side and swirls."""
-    shape = tuple(round(size / VOXEL_SIZE) for size in SIZE)
-    x, y, z = np.meshgrid(*(np.arange(size) for size in shape), indexing="ij")
-    density = (120 * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / 12)).astype(np.uint8)
-    velocity = np.stack([np.sin(0.3 * z), np.cos(0.3 * z), 1.0 + 0.1 * x], axis=-1).astype(np.float16)
-    return Plume(
-        scene=plume(3),
-        density=np.broadcast_to(density, (NUM_FRAMES, *shape)),
-        velocity=np.broadcast_to(velocity, (NUM_FRAMES // VELOCITY_EVERY + 1, *velocity.shape)),
-        origin=(-5.83, -5.83, 0.17),
-    )
+    x, y, z = grid()
+    density = 120 * np.exp(-((x - 18 - 0.1 * z) ** 2 + (y - 18) ** 2) / 12)
+    return made_plume(density, np.stack([np.sin(0.3 * z), np.cos(0.3 * z), 1.0 + 0.1 * x], axis=-1))
 
 
 def records(of: Plume, *, shift: int) -> list[VolumeRecord]:
