@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 MAX_COURANT = 0.6  # largest sum over the axes of |velocity| dt / h in one substep
+_NONE = np.float32(0.0)
 
 
 def transport(
@@ -58,47 +59,56 @@ def _rate(field: np.ndarray, u: np.ndarray, v: np.ndarray, w: np.ndarray, step: 
     return out * float(step)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy", inline="always")
 def _flux(speed, a, b, c, d):
-    """Flux through the face between cells b and c, with a and d beyond them. Koren 1993 eq. 22: b + phi(r) (b - a) / 2."""
-    if speed < 0.0:
-        a, b, c, d = d, c, b, a
-    behind = b - a
-    ahead = c - b
-    if behind * ahead <= 0.0:
-        return speed * b
+    """Flux through the face between cells b and c, with a and d beyond them. Koren 1993 eq. 22: b + phi(r) (b - a) / 2.
+
+    Values are chosen between without a branch, so that a processor computes several faces of a row at once."""
+    is_back = speed < _NONE
+    far, near, next_ = (d if is_back else a), (c if is_back else b), (b if is_back else c)
+    behind, ahead = near - far, next_ - near
     r = ahead / behind
     limited = min(min(2.0 * r, (1.0 + 2.0 * r) / 3.0), 2.0)
-    return speed * (b + np.float32(0.5) * np.float32(limited) * behind)
+    value = near + np.float32(0.5) * np.float32(limited) * behind
+    return speed * (value if behind * ahead > _NONE else near)
 
 
-@numba.njit(cache=True)
-def _net(before, after, far_a, a, c, b, far_b, is_first, is_last):
-    """Net outflow of cell c along one axis; a and b are its neighbours. Open ends let smoke out and clean air in."""
-    zero = np.float32(0.0)
-    right = max(after, zero) * c if is_last else _flux(after, a, c, b, far_b)
-    left = min(before, zero) * c if is_first else _flux(before, far_a, a, c, b)
-    return right - left
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _net_across(left, right, a, b, c, d, e, is_first, is_last, net):
+    """Fill `net` [nz] with the outflow of a row of cells c through the faces to its left and right, where these are the speeds.
+    a, b, d, e: the rows beside it. Open ends let smoke out and clean air in."""
+    if is_last:
+        for k in range(len(c)):
+            net[k] = max(right[k], _NONE) * c[k]
+    else:
+        for k in range(len(c)):
+            net[k] = _flux(right[k], b[k], c[k], d[k], e[k])
+    if is_first:
+        for k in range(len(c)):
+            net[k] -= min(left[k], _NONE) * c[k]
+    else:
+        for k in range(len(c)):
+            net[k] -= _flux(left[k], a[k], b[k], c[k], d[k])
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _fill_rate(q, u, v, w, step, rate):
     # Beyond an end the edge cell is repeated, so that both cells beside a face see the same four values there.
     nx, ny, nz = q.shape
     for i in numba.prange(nx):
         i0, i1, i2, i3 = max(i - 2, 0), max(i - 1, 0), min(i + 1, nx - 1), min(i + 2, nx - 1)
+        net_x, net_y = np.empty(nz, np.float32), np.empty(nz, np.float32)
+        column, through = np.empty(nz + 4, np.float32), np.empty(nz + 1, np.float32)
         for j in range(ny):
             j0, j1, j2, j3 = max(j - 2, 0), max(j - 1, 0), min(j + 1, ny - 1), min(j + 2, ny - 1)
+            row = q[i, j]
+            _net_across(u[i, j], u[i + 1, j], q[i0, j], q[i1, j], row, q[i2, j], q[i3, j], i == 0, i == nx - 1, net_x)
+            _net_across(v[i, j], v[i, j + 1], q[i, j0], q[i, j1], row, q[i, j2], q[i, j3], j == 0, j == ny - 1, net_y)
+            column[2 : nz + 2] = row
+            column[:2], column[nz + 2 :] = row[0], row[nz - 1]
+            speed = w[i, j]
+            for k in range(nz + 1):
+                through[k] = _flux(speed[k], column[k], column[k + 1], column[k + 2], column[k + 3])
+            through[0], through[nz] = min(speed[0], _NONE) * row[0], max(speed[nz], _NONE) * row[nz - 1]
             for k in range(nz):
-                k0, k1, k2, k3 = max(k - 2, 0), max(k - 1, 0), min(k + 1, nz - 1), min(k + 2, nz - 1)
-                c = q[i, j, k]
-                total = _net(
-                    u[i, j, k], u[i + 1, j, k], q[i0, j, k], q[i1, j, k], c, q[i2, j, k], q[i3, j, k], i == 0, i == nx - 1
-                )
-                total += _net(
-                    v[i, j, k], v[i, j + 1, k], q[i, j0, k], q[i, j1, k], c, q[i, j2, k], q[i, j3, k], j == 0, j == ny - 1
-                )
-                total += _net(
-                    w[i, j, k], w[i, j, k + 1], q[i, j, k0], q[i, j, k1], c, q[i, j, k2], q[i, j, k3], k == 0, k == nz - 1
-                )
-                rate[i, j, k] = -step * total
+                rate[i, j, k] = -step * (net_x[k] + net_y[k] + (through[k + 1] - through[k]))
