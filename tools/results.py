@@ -41,6 +41,7 @@ def page() -> str:
         "Made by `python -m tools.results` from `docs/results/*.json`, which the named commands wrote. Times are of one "
         "shared machine with two cores that was not always quiet; ratios and memory depend on that less.\n",
         *(reconstruction(load("reconstruction"), IMAGES, per_frame) if has("reconstruction") else []),
+        *(velocity_scales(load("velocity_scales")) if has("velocity_scales") else []),
         *(tilted_scene(load("tilted_scene")) if has("tilted_scene") else []),
         *whole_path(load("whole_path")),
         *(clip_length(load("clip_length")) if has("clip_length") else []),
@@ -61,6 +62,32 @@ def has(name: str) -> bool:
 
 def load(name: str) -> dict[str, Any]:
     return json.loads((FIGURES / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def velocity_scales(figures: dict[str, Any]) -> list[str]:
+    scenes = figures["scenes"]
+    ways = list(next(iter(scenes.values())))
+    axes = list(next(iter(next(iter(scenes.values())).values())))
+    means = {way: {axis: sum(of[way][axis] for of in scenes.values()) / len(scenes) for axis in axes} for way in ways}
+    blurs = [way.removeprefix("ours, ") for way in ways if way.startswith("ours, ")]
+    marked = {scene + ("*" if scene in figures["untouched"] else ""): found for scene, found in scenes.items()} | {"mean": means}
+    rows = [
+        [scene, blur, *(f"{found[f'{way}, {blur}'][axis]:.2f}" for way in ("ours", "sharpness") for axis in axes)]
+        for scene, found in marked.items()
+        for blur in blurs
+    ]
+    rays = [[scene, *(f"{found['rays'][axis]:.2f}" for axis in axes)] for scene, found in marked.items()]
+    return [
+        "## Motion by the size of eddies\n",
+        "`python -m benchmarks.velocity_scales --jobs DIR/final/default --json docs/results/velocity_scales.json`: correlation "
+        "of velocity inside true smoke, of both sides blurred alike by so many metres (standard deviation; 0: as it is scored "
+        "above). Beside it, in the three last columns, what an answer without any error but its sharpness would be scored: the "
+        "truth so blurred, against itself.\n",
+        table(["scene", "blur, m", *axes, *(f"{axis}, so sharp" for axis in axes)], rows),
+        "What an answer would be scored that knows the mean motion on every ray of the camera without error, and nothing of how "
+        "it changes along the ray:\n",
+        table(["scene", *axes], rays),
+    ]
 
 
 def tilted_scene(figures: dict[str, Any]) -> list[str]:

@@ -81,10 +81,15 @@ def relative_l2(density: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm((density - truth).ravel()) / max(np.linalg.norm(truth.ravel()), 1e-12))
 
 
+def inside_smoke(density: np.ndarray) -> np.ndarray:
+    """[X, Y, Z]: where there is smoke whose motion is scored, above a hundredth of the peak."""
+    return density > 0.01 * density.max()
+
+
 def velocity_scores(velocity: np.ndarray, truth: np.ndarray, density: np.ndarray, axes: np.ndarray) -> dict[str, float]:
-    """Of [X, Y, Z, 3] m/s inside true smoke (density above a hundredth of its peak): correlation along the rows of `axes`
+    """Of [X, Y, Z, 3] m/s inside true smoke (inside_smoke of its density): correlation along the rows of `axes`
     [3, 3] (sideways, up, in depth of a camera), and the root mean squared end-point error, m/s."""
-    inside = density > 0.01 * density.max()
+    inside = inside_smoke(density)
     ours, real = velocity[inside] @ axes.T, truth[inside] @ axes.T
     names = ("sideways", "up", "depth")
     found = {f"correlation_{name}": correlation(ours[:, axis], real[:, axis]) for axis, name in enumerate(names)}

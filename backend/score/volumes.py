@@ -13,7 +13,7 @@ from backend.score import measures
 from backend.score.tally import mean, rounded
 from backend.score.truth_set import Truth, Volume
 
-_LEAST_PEAK = 0.05  # 1/m; a moment with less shows no smoke
+LEAST_PEAK = 0.05  # 1/m; a moment with less shows no smoke
 
 
 class Volumes(Protocol):
@@ -34,7 +34,7 @@ def volume_scores(prediction: Volumes, truth: Truth, *, report: Report) -> dict[
     for step, frame in enumerate(frames):
         report.progress(step, len(frames))
         real = truth.volume(frame)
-        if real.density.max() < _LEAST_PEAK:
+        if real.density.max() < LEAST_PEAK:
             continue
         density, velocity = prediction.volume(real, frame)
         rows.append(
