@@ -15,7 +15,6 @@ from __future__ import annotations
 from backend import kernel_setup  # noqa: F401 before numba loads
 
 # isort: split
-import argparse
 import json
 import math
 import sys
@@ -26,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from backend.contract.cameras import Cameras, read_cameras
-from backend.contract.result import RESULT_FILE
 from backend.fit.depth_prior import inflate
 from backend.fit.guide import Guide
 from backend.fit.scene import Scene, make_scene, optical_depth
@@ -43,7 +41,7 @@ from backend.reporting import SilentReport
 from backend.score.truth_set import Volume, read_truth_set
 from backend.score.volumes import volume_scores
 from backend.stages import volume
-from benchmarks.reconstruction import SETS
+from benchmarks.finished_jobs import read_options
 from synthetic.progress import Progress
 
 _SUM = 3 * math.pi / 8  # of (1 - s^2)^1.5 over -1..1
@@ -87,15 +85,8 @@ class Network:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=Path, required=True)
-    parser.add_argument("--from", dest="source", type=Path, default=SETS)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args(arguments)
-    jobs = sorted(path.parent for path in given.jobs.glob(f"*/{RESULT_FILE}"))
-    if not jobs:
-        parser.error(f"{given.jobs} holds no finished job; run benchmarks.reconstruction first.")
-    scenes = {job.name: scene_figures(job, given.source / job.name) for job in jobs}
+    given = read_options(arguments, description=__doc__)
+    scenes = {job.name: scene_figures(job, given.source / job.name) for job in given.jobs}
     for scene, figures in scenes.items():
         print(f"{scene:<18} " + " ".join(f"{name} {value:.3f}" for name, value in figures.items()))
     if given.json is not None:

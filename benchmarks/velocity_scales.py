@@ -19,16 +19,13 @@ from __future__ import annotations
 from backend import kernel_setup  # noqa: F401 before numba loads
 
 # isort: split
-import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
-from backend.contract.result import RESULT_FILE
 from backend.contract.truth import INPUT_VIEW
 from backend.geometry.camera import View
 from backend.io.atomic import write_text
@@ -37,7 +34,8 @@ from backend.score.finished_job import open_job
 from backend.score.measures import correlation, inside_smoke
 from backend.score.truth_set import TruthSet, Volume, read_truth_set
 from backend.score.volumes import LEAST_PEAK, Volumes, camera_axes
-from benchmarks.reconstruction import SETS, UNTOUCHED
+from benchmarks.finished_jobs import read_options
+from benchmarks.reconstruction import UNTOUCHED
 from synthetic.progress import Progress
 
 BLURS = (0.0, 0.25, 0.5, 1.0)  # m
@@ -45,22 +43,15 @@ AXES = ("sideways", "up", "depth")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=Path, required=True)
-    parser.add_argument("--from", dest="source", type=Path, default=SETS)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args(arguments)
-    jobs = sorted(path.parent for path in given.jobs.glob(f"*/{RESULT_FILE}"))
-    if not jobs:
-        parser.error(f"{given.jobs} holds no finished job; run benchmarks.reconstruction first.")
+    given = read_options(arguments, description=__doc__)
     marks, scenes = set(), {}
-    for job in jobs:
+    for job in given.jobs:
         truth = read_truth_set(given.source / job.name)
         with open_job(JobFolder(job), truth) as opened:
             marks.add(opened.particles.info.provenance.get("prior_fingerprint"))
             scenes[job.name] = scene_figures(opened.prediction, truth)
     if len(marks) > 1:
-        parser.error(f"The jobs in {given.jobs} were fitted with different weights; fit them anew with one version.")
+        given.parser.error("These jobs were fitted with different weights; fit them anew with one version.")
     for scene, ways in scenes.items():
         for way, found in ways.items():
             print(f"{scene:<18} {way:<16} " + " ".join(f"{name} {value:.3f}" for name, value in found.items()))
