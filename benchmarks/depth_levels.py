@@ -15,7 +15,6 @@ Pictures are of evenly lit smoke, sRGB on black, at half the benchmark's size; t
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -24,19 +23,17 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from backend.contract.result import RESULT_FILE
 from backend.contract.truth import INPUT_VIEW
 from backend.field.rays import optical_depth
 from backend.geometry.camera import View, resized
 from backend.geometry.lattice import Lattice
 from backend.io.atomic import write_text
 from backend.io.job_folder import JobFolder
-from backend.io.particles import read_particles
 from backend.prior.window import Stand, stand_before
 from backend.score.exported import Exported
 from backend.score.measures import coded, correlation, decibels
 from backend.score.truth_set import Truth, read_truth_set
-from benchmarks.reconstruction import SETS
+from benchmarks.finished_jobs import read_options
 from synthetic.progress import Progress
 
 WAYS = ("as it is", "still", "at each moment", "and as deep")
@@ -50,20 +47,10 @@ _SIZE = 64, 64, 84  # voxels
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=Path, required=True)
-    parser.add_argument("--from", dest="source", type=Path, default=SETS)
-    parser.add_argument("--scenes", default="puff_front,merging_sources,steady_plume")
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args(arguments)
-    scenes = given.scenes.split(",")
-    missing = [scene for scene in scenes if not (given.jobs / scene / RESULT_FILE).is_file()]
-    if missing:
-        parser.error(f"{given.jobs} holds no finished job of {', '.join(missing)}; run benchmarks.reconstruction first.")
-    weights = {_weights_of(given.jobs / scene) for scene in scenes}
-    if len(weights) > 1:
-        parser.error(f"The jobs in {given.jobs} were fitted with different weights; fit them anew with one version.")
-    found = {scene: scene_figures(given.jobs / scene, read_truth_set(given.source / scene)) for scene in scenes}
+    given = read_options(arguments, description=__doc__, scenes="puff_front,merging_sources,steady_plume")
+    weights = given.weights()
+    found = {job.name: scene_figures(job, read_truth_set(given.source / job.name)) for job in given.jobs}
+    scenes = list(found)
     found["mean"] = {
         way: {name: round(float(np.mean([found[scene][way][name] for scene in scenes])), 3) for name in FIGURES} for way in WAYS
     }
@@ -72,15 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for way, figures in ways.items():
             print(f"{scene:<18} {way:<16} " + " ".join(f"{figures[name]:>11.3f}" for name in FIGURES))
     if given.json is not None:
-        write_text(given.json, json.dumps({"weights": weights.pop(), "scenes": found}, indent=1, allow_nan=False) + "\n")
+        write_text(given.json, json.dumps({"weights": weights, "scenes": found}, indent=1, allow_nan=False) + "\n")
     return 0
-
-
-def _weights_of(job: Path) -> str | None:
-    """What the prior's weights of a job are known by; None without a prior."""
-    with read_particles(JobFolder(job).particles) as particles:
-        mark = particles.info.provenance.get("prior_fingerprint")
-    return mark and mark[:12]
 
 
 def scene_figures(job: Path, truth: Truth) -> dict[str, dict[str, float]]:

@@ -1,6 +1,6 @@
 """Densities that know nothing but their own frame, or little more, beside those that finished jobs made of the whole clip.
 
-    python -m benchmarks.per_frame --jobs DIR [--from SET] [--json FILE]
+    python -m benchmarks.per_frame --jobs DIR [--from SET] [--scenes A,B] [--json FILE]
 
 DIR holds finished jobs, as benchmarks.reconstruction leaves them in OUT/PRESET/default. Correlations with the true density, means
 over the moments with smoke, as `evaluate` has them:

@@ -1,6 +1,6 @@
 """How right the motion of finished jobs is by the size of eddies, and what any answer of a given sharpness could reach.
 
-    python -m benchmarks.velocity_scales --jobs DIR [--from SET] [--json FILE]
+    python -m benchmarks.velocity_scales --jobs DIR [--from SET] [--scenes A,B] [--json FILE]
 
 DIR holds finished jobs, as benchmarks.reconstruction leaves them in OUT/PRESET/default. Correlations with the true velocity
 inside true smoke, sideways, up and in depth as the input camera sees it, means over the moments with smoke, as `evaluate`
@@ -44,21 +44,17 @@ AXES = ("sideways", "up", "depth")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     given = read_options(arguments, description=__doc__)
-    marks, scenes = set(), {}
+    weights, scenes = given.weights(), {}
     for job in given.jobs:
         truth = read_truth_set(given.source / job.name)
         with open_job(JobFolder(job), truth) as opened:
-            marks.add(opened.particles.info.provenance.get("prior_fingerprint"))
             scenes[job.name] = scene_figures(opened.prediction, truth)
-    if len(marks) > 1:
-        given.parser.error("These jobs were fitted with different weights; fit them anew with one version.")
     for scene, ways in scenes.items():
         for way, found in ways.items():
             print(f"{scene:<18} {way:<16} " + " ".join(f"{name} {value:.3f}" for name, value in found.items()))
     if given.json is not None:
-        mark = marks.pop()
         untouched = [scene for scene in scenes if scene in UNTOUCHED]
-        found = {"weights": mark and mark[:12], "untouched": untouched, "scenes": scenes}
+        found = {"weights": weights, "untouched": untouched, "scenes": scenes}
         write_text(given.json, json.dumps(found, indent=1, allow_nan=False) + "\n")
     return 0
 

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 MAX_COURANT = 0.6  # largest sum over the axes of |velocity| dt / h in one substep
-_NONE = np.float32(0.0)
+_ZERO = np.float32(0.0)
 
 
 def transport(
@@ -64,13 +64,13 @@ def _flux(speed, a, b, c, d):
     """Flux through the face between cells b and c, with a and d beyond them. Koren 1993 eq. 22: b + phi(r) (b - a) / 2.
 
     Values are chosen between without a branch, so that a processor computes several faces of a row at once."""
-    is_back = speed < _NONE
-    far, near, next_ = (d if is_back else a), (c if is_back else b), (b if is_back else c)
-    behind, ahead = near - far, next_ - near
+    is_back = speed < _ZERO
+    far, near, beyond = (d if is_back else a), (c if is_back else b), (b if is_back else c)
+    behind, ahead = near - far, beyond - near
     r = ahead / behind
     limited = min(min(2.0 * r, (1.0 + 2.0 * r) / 3.0), 2.0)
     value = near + np.float32(0.5) * np.float32(limited) * behind
-    return speed * (value if behind * ahead > _NONE else near)
+    return speed * (value if behind * ahead > _ZERO else near)
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -79,13 +79,13 @@ def _net_across(left, right, a, b, c, d, e, is_first, is_last, net):
     a, b, d, e: the rows beside it. Open ends let smoke out and clean air in."""
     if is_last:
         for k in range(len(c)):
-            net[k] = max(right[k], _NONE) * c[k]
+            net[k] = max(right[k], _ZERO) * c[k]
     else:
         for k in range(len(c)):
             net[k] = _flux(right[k], b[k], c[k], d[k], e[k])
     if is_first:
         for k in range(len(c)):
-            net[k] -= min(left[k], _NONE) * c[k]
+            net[k] -= min(left[k], _ZERO) * c[k]
     else:
         for k in range(len(c)):
             net[k] -= _flux(left[k], a[k], b[k], c[k], d[k])
@@ -109,6 +109,6 @@ def _fill_rate(q, u, v, w, step, rate):
             speed = w[i, j]
             for k in range(nz + 1):
                 through[k] = _flux(speed[k], column[k], column[k + 1], column[k + 2], column[k + 3])
-            through[0], through[nz] = min(speed[0], _NONE) * row[0], max(speed[nz], _NONE) * row[nz - 1]
+            through[0], through[nz] = min(speed[0], _ZERO) * row[0], max(speed[nz], _ZERO) * row[nz - 1]
             for k in range(nz):
                 rate[i, j, k] = -step * (net_x[k] + net_y[k] + (through[k + 1] - through[k]))
