@@ -177,7 +177,7 @@ def main(arguments: list[str]) -> int:
         of_level, of_parts, of_width, unlikely = errors(net, part)
         terms = [bounded(each, worst=_WORST) for each in (of_level, of_parts, of_width)]
         loss = (terms[0] + _OF_PARTS * terms[1] + _OF_WIDTH * terms[2]).mean() + _OF_DOUBT * unlikely.mean()
-        learn(net, mean, optimiser, loss, share=max(_FORGOTTEN, 1 / (step + 1)))
+        learn(net, mean, [optimiser], loss, share=max(_FORGOTTEN, 1 / (step + 1)))
         sums, since = sums + torch.stack([of_level, of_parts, of_width, unlikely]).detach().mean(dim=1), since + 1
         if (step + 1) % max(1, given.steps // 20) == 0:
             taught = sums / since

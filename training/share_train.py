@@ -207,7 +207,7 @@ def main(arguments: list[str]) -> int:
         between = float(draw.choice([-1, 1]) * draw.uniform(*_BETWEEN))
         of_space, of_views = errors(net, part, (_ASIDE, between))
         loss = (bounded(of_space, worst=_WORST) + given.of_views * of_views.log().mean(1)).mean()
-        learn(net, mean, optimiser, loss, share=max(_FORGOTTEN, 1 / (step + 1)))
+        learn(net, mean, [optimiser], loss, share=max(_FORGOTTEN, 1 / (step + 1)))
         sums.append([of_space.mean().item(), -10 / math.log(10) * of_views.log().mean().item()])
         if (step + 1) % max(1, given.steps // 10) == 0:
             space, db = np.mean(sums, axis=0)

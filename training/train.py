@@ -29,13 +29,14 @@ from backend.prior.predict import read_weights, save_weights
 from backend.prior.shares import read_share_net
 from backend.prior.window import NUM_CONDITIONS, OFFSETS, SHAPE
 from backend.score.measures import correlation
-from training.learning import learn
+from training.learning import KernelMuon, learn
 
 _HELD_BACK = 10  # every such plume
 _SCORED = 4  # every such lesson of those held back
 _SLOW = 0.2  # voxels a stride: motion that need not be known better than that
 _WORST = 2.0  # that the error of one lesson can count: a few show hardly any of the smoke that is there
 _BATCH = 8
+_DECAY = 1e-4  # of the weights, times the rate
 _FORGOTTEN = 1e-3  # of the running mean of the weights, at each step
 
 
@@ -108,6 +109,16 @@ def take_over(net: PlumeNet, state: dict[str, Tensor]) -> None:
     net.load_state_dict(state)
 
 
+def optimisers_of(net: PlumeNet, *, rate: float) -> tuple[torch.optim.Optimizer, ...]:
+    """Of the kernels between layers, and of all else."""
+    kernels = {name: each for name, each in net.named_parameters() if each.dim() == 5 and not name.endswith("exit.weight")}
+    others = [each for name, each in net.named_parameters() if name not in kernels]
+    return (
+        KernelMuon(kernels.values(), lr=rate, weight_decay=_DECAY),
+        torch.optim.AdamW(others, lr=rate, weight_decay=_DECAY),
+    )
+
+
 def score(net: PlumeNet, lessons: Lessons) -> dict[str, float]:
     """Means over lessons held back: correlation of density, and of velocity inside smoke along the grid's axes."""
     net.eval()
@@ -154,13 +165,14 @@ def main(arguments: list[str]) -> int:
     if given.start:
         take_over(net, read_weights(given.start)[1])
     mean = copy.deepcopy(net)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=1e-4)
+    optimisers = optimisers_of(net, rate=given.rate)
     first = 0
     if (given.out / "state.pt").exists():
         state = torch.load(given.out / "state.pt", weights_only=True)
         net.load_state_dict(state["net"])
         mean.load_state_dict(state["mean"])
-        optimiser.load_state_dict(state["optimiser"])
+        for optimiser, kept in zip(optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(kept)
         first = state["passes"]
     elif given.start:
         note(given.out, {"passes": 0, **score(mean, unseen)})
@@ -170,17 +182,17 @@ def main(arguments: list[str]) -> int:
         order = torch.randperm(len(lessons), generator=torch.Generator().manual_seed(number))
         for step in range(num_steps):
             done = (number * num_steps + step) / (given.passes * num_steps)
-            for group in optimiser.param_groups:
+            for group in (group for optimiser in optimisers for group in optimiser.param_groups):
                 group["lr"] = given.rate * min(1.0, 50 * done + 0.02) * 0.5 * (1 + math.cos(math.pi * done))
             batch = lessons.batch(order[step * _BATCH : (step + 1) * _BATCH], mirrored=bool((step + number) % 2))
             total, parts = losses(net, batch)
-            learn(net, mean, optimiser, total, share=max(_FORGOTTEN, 1 / (number * num_steps + step + 1)))
+            learn(net, mean, optimisers, total, share=max(_FORGOTTEN, 1 / (number * num_steps + step + 1)))
             sums += parts
         line = {"passes": number + 1, "losses": [round(value, 4) for value in sums / num_steps]}
         note(given.out, line | {"seconds": round(time.monotonic() - begin, 1), **score(mean, unseen)})
         with whole_file(given.out / "state.pt") as part:
-            kept = {"net": net.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
-            torch.save({**kept, "passes": number + 1}, part)
+            kept = {"net": net.state_dict(), "mean": mean.state_dict()}
+            torch.save({**kept, "optimisers": [optimiser.state_dict() for optimiser in optimisers], "passes": number + 1}, part)
         with whole_file(given.out / "plumes.npz") as part, open(part, "wb") as file:
             small = (read_level_net(given.start), read_share_net(given.start)) if given.start else ()
             save_weights(mean, file, *small)
