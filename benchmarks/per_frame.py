@@ -120,7 +120,7 @@ def own_words(layers: FrameStack, cameras: Cameras, *, name: str) -> list[Volume
         proposals.append(record)
         progress.step()
     return [
-        plan.record(replace(word.said, density=plan.agreed(word.said.density, word.said.stand, word.frame)))
+        plan.record(replace(word.said, density=plan.agreed(word.said.density, word.said.stand, word.frame)), word.frame)
         for word in volume.words(plan, proposals, None, range(plan.region.num_frames))
     ]
 

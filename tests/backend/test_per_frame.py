@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from backend.field.rays import optical_depth
+from backend.fit.guide import Guide
 from backend.fit.scene import Scene
 from backend.geometry.camera import view_at
 from backend.score.measures import correlation
 from backend.score.truth_set import Volume
-from benchmarks.per_frame import CrossSections, main
+from benchmarks.per_frame import CrossSections, main, own_words
 from synthetic.sweep import Orbit, orbit_cameras
 
 CAMERAS = orbit_cameras(Orbit(target=(0.0, 0.0, 3.0), half_height=2.5), width=72, height=96, fps=15.0, num_frames=4)
@@ -44,6 +45,17 @@ def test_round_smoke_is_found_and_flat_smoke_taken_for_round(deep: float, least:
     assert least < correlation(found, real.density) <= most
     assert found.sum() == pytest.approx(real.density.sum(), rel=0.05)
     assert not velocity.any()
+
+
+def test_the_network_alone_says_smoke_that_shows_what_the_frames_show() -> None:
+    real, views = puff(1.2, 1.2), [view_at(CAMERAS, frame) for frame in range(4)]
+    opacities = [-np.expm1(-optical_depth(real.density, real.lattice, view)) for view in views]
+    records = own_words([np.repeat(opacity[..., None], 4, axis=2) for opacity in opacities], CAMERAS, name="puff")  # type: ignore[arg-type]
+    assert len(records) == 4
+    for record, view, opacity in zip(records, views, opacities, strict=True):
+        said = Guide(record)
+        shown = -np.expm1(-optical_depth(said.density, said.stand.lattice, said.stand.seen(view)))
+        assert correlation(shown, opacity) > 0.98
 
 
 def test_a_folder_without_jobs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
