@@ -23,7 +23,9 @@ class KernelMuon(torch.optim.Muon):
 
     def step(self, closure: Any = None) -> Any:
         for matrix, kernel in zip(self.param_groups[0]["params"], self.kernels, strict=True):
-            matrix.grad = None if kernel.grad is None else kernel.grad.permute(0, 2, 3, 4, 1).flatten(1)
+            matrix.grad = None
+            if kernel.grad is not None:
+                matrix.grad = _as_matrix(kernel.grad.contiguous(memory_format=torch.channels_last_3d))
         return super().step(closure)
 
 

@@ -19,9 +19,10 @@ from backend.prior.predict import Proposal, one_thread
 from backend.prior.sheets import UNIT, look_at_sheets, moments_around, parts
 from backend.prior.window import Stand
 
-OWN_ERROR = 2.0  # voxels that the middle of a proposal's level is taken to be off; tuned on ten held-back plumes and three scenes
+# Tuned on ten held-back plumes and three scenes, USUAL on eleven finer plumes and the scenes.
+OWN_ERROR = 2.0  # voxels that the middle of a proposal's level is taken to be off
 USUAL = 0.6  # voxels that the two are apart in a clip in which the large one may as well have lost its way as not
-_POWER = 8  # how soon it is one or the other; tuned on the same plumes and scenes, USUAL on eleven of 0.25 m
+_POWER = 8  # how soon it is one or the other
 _SMOOTH = 1.5  # voxels of height, standard deviation: neighbouring levels move alike
 _FAINT = 0.01  # of the fullest level: one with less does not move of itself
 
