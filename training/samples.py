@@ -14,7 +14,7 @@ from backend.fit.region import CELLS_HIGH, CELLS_WIDE, PIXELS_A_CELL
 from backend.fit.source import source_point
 from backend.geometry.camera import View
 from backend.geometry.lattice import Lattice
-from backend.prior.window import SHAPE, Stand, Window, look, stand_before
+from backend.prior.window import SHAPE, Stand, Window, away_of, look, stand_before
 from synthetic.sweep import Orbit, orbit_cameras
 from training.library import FPS, NUM_FRAMES, VELOCITY_EVERY, Plume
 
@@ -26,6 +26,8 @@ _STEP_SPREAD = 0.25  # of its logarithm
 _SHORTEST = 15, 90  # frames of a clip, of one lesson in two
 _OFF, _OFTEN = (1.5, 4.5), (0.5, 0.5)  # voxels, by which grids stand beside the smoke: taught that they stand right, the prior
 # would leave those where they are that do not
+_UNTOLD = 3.0  # voxels, by which a grid stands before or behind where smoke is taken to rise, of a camera that stands still
+_KINDS = {"orbit": 0.65, "still": 0.2, "wild": 0.15}  # of cameras, and how often
 _LEAST_CELL = 0.2  # m; the plumes know nothing finer
 _FRAMES = 5  # that tell where a clip's smoke is and how fast
 _EDGE = 0.03  # of the largest optical depth: where smoke ends
@@ -52,7 +54,7 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     first = int(draw.integers(0, NUM_FRAMES - num_frames + 1))
     candidates = [t for t in range(first, first + num_frames) if t % VELOCITY_EVERY == 0]
     moment = int(draw.choice(candidates))
-    kind = draw.choice(["orbit", "still", "wild"], p=[0.7, 0.15, 0.15])
+    kind = draw.choice(list(_KINDS), p=list(_KINDS.values()))
     smoke = smoke_of(plume, first, num_frames)
     is_whole = draw.random() < _WHOLE
     cell = cell_for(smoke, draw, is_whole=is_whole)
@@ -62,18 +64,21 @@ def draw_lesson(plume: Plume, draw: np.random.Generator) -> Lesson:
     size = draw.integers(LEAST_WHOLE if is_whole else LEAST, MOST, endpoint=True)
     stride = stride_for(smoke, draw, cell=cell, num_frames=num_frames)
     views = camera_way(draw, kind, num_frames, height=centre[2], pixel=cell / PIXELS_A_CELL, size=size)
-    stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
     lattice = lattice_of(plume)
     noise = draw.choice([0.002, 0.01])
 
     def clear_depth_at(index: int) -> np.ndarray:
         return optical_depth(plume.density_at(first + index), lattice, views[index], step=1.0)
 
-    if kind == "still":  # nothing tells how far away it is
+    if kind == "still":  # nothing tells how far away it is, nor may where the grid stands
         source = np.mean([item.position for item in plume.scene.sources], axis=0) + draw.normal(0.0, 0.25, 3)
         source += draw.normal(0.0, 0.8) * views[0].camera_to_world[:3, 2]
+        away = away_of(views[0])
+        centre += away * (away @ (source - centre) + draw.normal(0.0, _UNTOLD * cell))
     else:
         source = source_point(clear_depth_at, views, most_frames=FOOT_FRAMES) + draw.normal(0.0, 0.15, 3)
+
+    stand = stand_before(views[moment - first], centre, voxel_size=cell, shape=SHAPE)
 
     def depth_at(index: int) -> np.ndarray:
         return filmed(clear_depth_at(index), noise, draw)

@@ -78,18 +78,20 @@ def held_back(plumes: list[Path]) -> list[Path]:
 
 
 def losses(net: PlumeNet, lesson: tuple[Sight, Tensor, Tensor]) -> tuple[Tensor, list[float]]:
-    """What is to become small, and of each net the squared error of density and of velocity inside smoke, each in units of the
-    truth's own size."""
+    """What is to become small, and of each net the squared error of density, in units of the truth's own size, and of velocity
+    inside smoke, in units of how much the truth varies along the same axis, in the mean over the three: most smoke rises much
+    faster than it goes sideways or in depth."""
     sight, density, velocity = lesson
     weight = density / (density + 0.05 * density.amax((1, 2, 3), keepdim=True) + 1e-6)
-    weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
-    speed = (weight * velocity.square().sum(1)).sum((1, 2, 3)) + _SLOW**2
+    weight = (weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-6))[:, None]
+    usual = (weight * velocity).sum((2, 3, 4), keepdim=True)
+    spread = (weight * (velocity - usual).square()).sum((2, 3, 4)) + _SLOW**2
     total, parts = torch.zeros(()), []
     with torch.autocast("cpu", dtype=torch.bfloat16):
         answers = net(sight, SHAPE)
     for (ours, moves), share in zip(answers, (0.5, 1.0), strict=True):
         of_density = (ours - density).square().sum((1, 2, 3)) / density.square().sum((1, 2, 3)).clamp_min(1e-3)
-        of_velocity = (weight * (moves - velocity).square().sum(1)).sum((1, 2, 3)) / speed
+        of_velocity = (weight * (moves - velocity).square()).sum((2, 3, 4)) / spread
         total = total + share * (bounded(of_density).mean() + 0.5 * bounded(of_velocity).mean())
         parts += [of_density.mean().item(), of_velocity.mean().item()]
     return total, parts

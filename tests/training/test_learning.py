@@ -56,6 +56,23 @@ def test_every_weight_has_one_optimiser() -> None:
     assert sum(len(group["params"]) for group in adam.param_groups) == len(before) - len(by_muon)
 
 
+def test_motion_counts_by_how_much_it_varies_along_its_axis() -> None:
+    """Not by how fast the smoke is: half of what goes sideways missed is as bad as half of what goes up."""
+    draw = torch.Generator().manual_seed(0)
+    spread, usual = torch.tensor([1.0, 1.5, 6.0]), torch.tensor([0.0, 0.0, 20.0])
+    density = torch.ones((2, 6, 6, 6))
+    velocity = torch.randn((2, 3, 6, 6, 6), generator=draw) * spread[:, None, None, None] + usual[:, None, None, None]
+
+    def lost(error: torch.Tensor) -> float:
+        answer = density, velocity + error[:, None, None, None]
+        return float(train.losses(lambda *_: (answer, answer), (None, density, velocity))[0])  # type: ignore[arg-type]
+
+    by_axis = [lost(0.5 * spread * torch.eye(3)[axis]) for axis in range(3)]
+    assert lost(torch.zeros(3)) == 0.0
+    assert by_axis == pytest.approx([by_axis[2]] * 3, rel=0.15)
+    assert lost(torch.full((3,), 0.5)) == pytest.approx(lost(torch.full((3,), -0.5)))
+
+
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")  # all of this plume moves alike
 def test_an_interrupted_training_goes_on_to_the_same_weights(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made_plumes import grid, made_plume
 
 from backend.prior.network import PlumeNet, Sight, seen_at
 from backend.prior.window import OFFSETS, SHAPE
 from training.lessons import write_lessons
-from training.library import Plume
+from training.library import VOXEL_SIZE, Plume
 from training.plumes import plume
 from training.samples import draw_lesson
 from training.train import Lessons, bounded, take_over
@@ -66,6 +67,22 @@ def test_the_source_is_found_in_the_pictures(recorded: Plume) -> None:
         assert image[max(0, lowest - 4) : lowest + 1, max(0, column - 5) : column + 6].any()
         count += 1
     assert count > 8
+
+
+def test_a_grid_before_a_still_camera_tells_nothing_of_depth() -> None:
+    """It stands where smoke is taken to rise, give or take, as a fit's does, wherever the smoke went from there."""
+    x, y, z = grid()
+    blown = made_plume(100 * np.exp(-((x - 30) ** 2 + (y - 30) ** 2) / 20 - (z - 18) ** 2 / 80))
+    beyond = np.array([blown.origin[axis] + VOXEL_SIZE * 30 for axis in (0, 1)])
+    assert np.linalg.norm(beyond - np.mean([item.position[:2] for item in blown.scene.sources], axis=0)) > 4.0
+    across, along = [], []
+    for number in range(60):
+        window = draw_lesson(blown, np.random.default_rng(number)).window
+        if np.ptp(window.conditions[len(OFFSETS) : 2 * len(OFFSETS)]) == 0.0:
+            across.append(abs(window.source[0] - 11.5))
+            along.append(abs(window.source[1] - 11.5))
+    assert len(along) > 5
+    assert np.mean(along) < 4.0 < np.mean(across)
 
 
 def test_the_same_number_draws_the_same_lesson_and_scene(recorded: Plume) -> None:
