@@ -25,6 +25,7 @@ COLUMNS = ("density1", "density2", "sideways2", "up2", "depth2")
         ("prior_training_short", 5),
         ("prior_training_found", 4),  # and one for what was started from
         ("prior_training_fine", 4),  # the same
+        ("prior_training_still", 5),  # the same
     ],
 )
 def test_the_page_shows_the_log_of_the_training(name: str, lines: int) -> None:
