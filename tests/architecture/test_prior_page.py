@@ -8,8 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from backend.geometry.camera import view_at
 from backend.prior.weights import WEIGHTS, weights_fingerprint
+from backend.prior.window import away_of
+from training.judge import standing
 from training.judge_still import WAYS
+from training.plumes import plume as scene_of
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 JUDGED = ("density", "sideways", "up", "depth", "level_m", "nvs_last_db", "side_db")
@@ -115,6 +119,26 @@ def test_the_page_shows_what_is_made_of_a_still_camera() -> None:
             digits = {"density": 3, "sideways": 2, "up": 2, "depth": 2, "turned_30_db": 2, "side_db": 2, "back_db": 2}
             cells = " | ".join(f"{np.mean([row[key] for row in rows]):.{count}f}" for key, count in digits.items())
             assert f"| {way} | {title}, {len(rows)} | {cells} |" in page
+
+
+def test_the_page_shows_what_wind_does_before_a_still_camera() -> None:
+    """The figures of today, the last of three in each cell."""
+    page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
+    plumes = json.loads((CHECKOUT / "docs" / "results" / "still_volumes.json").read_text(encoding="utf-8"))["plumes"]
+    away = away_of(view_at(standing(0.0), 0))[:2]
+    winds = {name: float(away @ scene_of(int(name.removeprefix("plume_"))).wind) for name in plumes}
+    groups = {
+        "0.8 m/s and more": (0.8, np.inf),
+        "0.3 to 0.8": (0.3, 0.8),
+        "less than 0.3 either way": (-0.3, 0.3),
+        "0.3 and more towards it": (-np.inf, -0.3),
+    }
+    for title, (least, most) in groups.items():
+        rows = [plumes[name]["as deep as wide"] for name, wind in winds.items() if least <= wind < most]
+        density, turned, side = (np.mean([row[key] for row in rows]) for key in ("density", "turned_30_db", "side_db"))
+        (line,) = (line for line in page.splitlines() if line.startswith(f"| {title} | {len(rows)} | "))
+        today = [cell.split(",")[-1].strip() for cell in line.strip("| ").split(" | ")[2:]]
+        assert today == [f"{density:.3f}", f"{turned:.1f}", f"{side:.1f}"]
 
 
 def test_the_page_shows_what_levels_cost() -> None:
