@@ -44,5 +44,4 @@ class Weighing:
             unsure=(finer * told.unsure).astype(np.float32),
             asked=told.asked.astype(np.float32),
             astray=np.asarray(finer * self.levels.apart, np.float32),
-            lost=np.asarray(self.levels.share, np.float32),
         )

@@ -36,7 +36,7 @@ class Known:
     the frame; sharp: what fixed powers make of these; depth: optical depth of the frame where each voxel is seen. In voxels:
     middle [X, Z], where along Y the network of levels has the middle of a column, width [Z], how wide columns are, unsure [Z],
     how unsure it is of their middles; asked [Z]: 1 where that network was, 0 where it was not. astray []: how far the two are
-    apart in the whole clip, in voxels; lost [], 0 to 1: how sure it is by that that the large one has lost its way.
+    apart in the whole clip, in voxels.
     """
 
     said: np.ndarray
@@ -49,7 +49,6 @@ class Known:
     unsure: np.ndarray
     asked: np.ndarray
     astray: np.ndarray
-    lost: np.ndarray
 
 
 NAMES = tuple(field.name for field in fields(Known))
@@ -119,8 +118,8 @@ class ShareNet(nn.Module):
 
 
 def weights_of(net: ShareNet, known: Mapping[str, Tensor]) -> Tensor:
-    """[B, X, Y, Z]: what `sharp` is to be multiplied by; 1 where the large network has not lost its way."""
-    return (known["lost"][:, None, None, None] * net(features_of(known))).exp()
+    """[B, X, Y, Z]: what `sharp` is to be multiplied by."""
+    return net(features_of(known)).exp()
 
 
 @torch.no_grad()

@@ -47,8 +47,8 @@ def test_the_page_shows_the_log_of_the_network_of_levels() -> None:
     page = (CHECKOUT / "docs" / "prior.md").read_text(encoding="utf-8")
     log = (CHECKOUT / "docs" / "results" / "prior_levels.jsonl").read_text(encoding="utf-8").splitlines()
     entries = [json.loads(line) for line in log]
-    assert len(entries) == 100  # twenty of each training
-    for number, name in enumerate(("first", "second", "third", "fourth", "fifth")):
+    assert len(entries) == 120  # twenty of each training
+    for number, name in enumerate(("first", "second", "third", "fourth", "fifth", "sixth")):
         training = entries[20 * number : 20 * (number + 1)]
         for entry in training[3::4]:
             cells = " | ".join(

@@ -29,7 +29,6 @@ def known(seed: int = 0) -> Known:
         unsure=draw.uniform(0.5, 2, SHAPE[2]).astype(np.float32),
         asked=np.linspace(0, 1, SHAPE[2]).astype(np.float32),
         astray=np.asarray(1.5 + seed, np.float32),
-        lost=np.asarray(1.0 / (1 + seed), np.float32),
     )
 
 
@@ -73,12 +72,6 @@ def test_levels_that_were_not_asked_have_no_say(net: ShareNet) -> None:
     one = replace(known(), asked=np.zeros(SHAPE[2], np.float32))
     other = replace(one, middle=one.middle + 2, width=2 * one.width, unsure=3 * one.unsure)
     np.testing.assert_array_equal(ask(net, one), ask(net, other))
-
-
-def test_where_the_large_network_has_not_lost_its_way_nothing_is_weighed(net: ShareNet) -> None:
-    one, half = (replace(known(), lost=np.asarray(lost, np.float32)) for lost in (0.0, 0.5))
-    np.testing.assert_array_equal(ask(net, one), one.sharp)
-    np.testing.assert_allclose(ask(net, half), np.sqrt(half.sharp * ask(net, known())), rtol=1e-4)
 
 
 def test_weights_are_bounded(net: ShareNet) -> None:
