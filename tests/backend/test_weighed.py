@@ -27,6 +27,7 @@ def test_it_is_known_how_far_the_two_networks_are_apart() -> None:
     found = own.known(said, said.density, said.density, FRAME)
     aim = said.stand.voxels(SOURCE[None])[0, 1] + 1.5 * UNIT
     assert float(found.astray) == pytest.approx(abs(aim - middles(said.density)[30]), rel=0.02)
+    assert 0.0 < own.levels.share <= 1.0
 
 
 @pytest.mark.parametrize("finer", [1.0, 1.5])
